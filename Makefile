@@ -1,0 +1,46 @@
+# make demo, make test: each does all set-up on a machine with Python >= 3.11, git and a C compiler.
+PYTHON ?= python3
+VENV   ?= .venv
+BIN    := $(VENV)/bin
+
+.PHONY: demo test test-long lint format docs bench figures clean
+
+# Core alone: what training needs, no simulator.
+$(VENV)/.core: pyproject.toml constraints.txt scripts/install.sh
+	PYTHON="$(PYTHON)" sh scripts/install.sh "$(VENV)" .
+	@touch $@
+
+$(VENV)/.dev: $(VENV)/.core
+	PYTHON="$(PYTHON)" sh scripts/install.sh "$(VENV)" ".[dev,wandb]"
+	@touch $@
+
+$(VENV)/.docs: $(VENV)/.core
+	PYTHON="$(PYTHON)" sh scripts/install.sh "$(VENV)" ".[docs]"
+	@touch $@
+
+demo: $(VENV)/.core
+	$(BIN)/python scripts/demo.py
+
+test: $(VENV)/.dev lint
+	$(BIN)/python -m pytest
+
+test-long: $(VENV)/.dev
+	$(BIN)/python -m pytest -m long --timeout=0
+
+lint: $(VENV)/.dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: $(VENV)/.dev
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+docs: $(VENV)/.docs
+	$(BIN)/mkdocs build --strict
+
+bench: $(VENV)/.core
+	$(BIN)/python benchmarks/learning.py --out benchmarks/output
+
+clean:
+	rm -rf $(VENV) runs multirun site build *.egg-info

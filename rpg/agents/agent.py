@@ -1,0 +1,107 @@
+"""What an agent is: something that draws a latent per episode, acts, and learns from segments."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from torch import Tensor
+
+from rpg.errors import RPGError
+from rpg.segments import SegmentBatch
+
+Metrics = dict[str, Tensor]
+
+
+class Agent:
+    """Base class. Subclasses override :meth:`act`, and what else they need.
+
+    Attributes:
+        obs_dim: length of the observation vector.
+        action_dim: length of the action vector.
+        latent_dim: length of z; 0 if the agent has none.
+        batch_size: segments per update; 0 if the agent does not learn.
+        horizon: steps per segment.
+        device: where tensors live.
+    """
+
+    latent_dim = 0
+    batch_size = 0
+    horizon = 1
+
+    def __init__(
+        self,
+        observation_space: gym.Space[Any],
+        action_space: gym.Space[Any],
+        device: torch.device | str = "cpu",
+    ) -> None:
+        if not isinstance(observation_space, gym.spaces.Box) or len(observation_space.shape) != 1:
+            raise RPGError(
+                f"observation space {observation_space}: a flat Box is needed; wrap the environment with "
+                "gymnasium.wrappers.FlattenObservation"
+            )
+        if not isinstance(action_space, gym.spaces.Box) or len(action_space.shape) != 1:
+            raise RPGError(f"action space {action_space}: a flat Box of continuous actions is needed")
+        if not (np.isfinite(action_space.low).all() and np.isfinite(action_space.high).all()):
+            raise RPGError(
+                f"action space {action_space}: bounds must be finite; wrap the environment with "
+                "gymnasium.wrappers.RescaleAction"
+            )
+        self.obs_dim = observation_space.shape[0]
+        self.action_dim = action_space.shape[0]
+        self.device = torch.device(device)
+        low = torch.as_tensor(action_space.low, dtype=torch.float32, device=self.device)
+        high = torch.as_tensor(action_space.high, dtype=torch.float32, device=self.device)
+        self._action_middle = (high + low) / 2
+        self._action_half = (high - low) / 2
+
+    def begin_episodes(self, obs: Tensor, mask: Tensor, latent: Tensor) -> Tensor:
+        """Draw a new z where an episode begins, keep it elsewhere.
+
+        Args:
+            obs: (n, obs_dim).
+            mask: (n,) bool, True where ``obs`` is the first of an episode.
+            latent: (n, latent_dim), the current ones.
+        """
+        return torch.where(mask.unsqueeze(1), self.sample_latent(obs), latent)
+
+    def sample_latent(self, obs: Tensor) -> Tensor:
+        """Draw z ~ pi(z|s1) for first observations (n, obs_dim); returns (n, latent_dim)."""
+        return obs.new_zeros(len(obs), self.latent_dim)
+
+    def act(self, obs: Tensor, latent: Tensor, deterministic: bool = False) -> Tensor:
+        """Actions (n, action_dim) in the environment's units for (n, obs_dim) and (n, latent_dim)."""
+        raise TypeError(f"{type(self).__name__} must define act")
+
+    def update(self, batch: SegmentBatch, env_steps: int = 0) -> Metrics:
+        """Learn from one batch; the returned scalars stay on the device.
+
+        Args:
+            batch: rewards already relabelled with any exploration bonus.
+            env_steps: environment steps so far, for schedules.
+        """
+        return {}
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything learned, as tensors and plain data."""
+        return {}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from :meth:`state_dict`."""
+
+    def episode_state(self) -> dict[str, Tensor]:
+        """What the agent remembers of running episodes; evaluation puts it back afterwards."""
+        return {}
+
+    def restore_episode_state(self, state: dict[str, Tensor]) -> None:
+        """Continue from :meth:`episode_state`."""
+
+    def to_env(self, action: Tensor) -> Tensor:
+        """From (-1, 1) to the environment's bounds."""
+        return self._action_middle + self._action_half * action
+
+    def from_env(self, action: Tensor) -> Tensor:
+        """From the environment's bounds to [-1, 1]."""
+        return (action - self._action_middle) / self._action_half

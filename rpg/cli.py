@@ -1,0 +1,114 @@
+"""What the Hydra entry points share: early checks of the command line, and errors in one line."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from hydra import compose, initialize_config_module
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from rpg.errors import RPGError, nearest
+
+_CONF = Path(__file__).parent / "conf"
+
+
+@contextmanager
+def report_errors() -> Iterator[None]:
+    """Turn an :class:`RPGError` into one line on stderr and exit code 2; Ctrl-C into exit code 130."""
+    try:
+        yield
+    except RPGError as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(2) from error
+    except KeyboardInterrupt:
+        raise SystemExit(130) from None
+
+
+def command_line() -> str:
+    """The command that started this process, ready to be pasted."""
+    return shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
+
+
+def check_overrides(args: list[str]) -> None:
+    """Check every ``key=value`` before Hydra starts, so that a typo costs nothing and explains itself.
+
+    Raises:
+        RPGError: a malformed override, an unknown group option or an unknown key.
+    """
+    texts = [a for a in args if not a.startswith("-") and "=" in a]
+    stray = [a for a in args if not a.startswith("-") and "=" not in a and not a.startswith("~")]
+    flags_with_value = {
+        "--config-dir",
+        "-cd",
+        "--config-name",
+        "-cn",
+        "--config-path",
+        "-cp",
+        "--package",
+        "-p",
+    }
+    if flags_with_value & set(args) or "--info" in args:
+        return  # the user brings configs of their own, or asks Hydra about itself
+    if stray and "--cfg" not in args and "-c" not in args:
+        raise RPGError(f"'{stray[0]}': overrides look like key=value, for instance agent=rpg")
+    try:
+        overrides = OverridesParser.create().parse_overrides(texts)
+    except HydraException as error:
+        raise RPGError(f"override: {str(error).strip().splitlines()[0]}") from error
+    groups = {
+        p.relative_to(_CONF).as_posix() for p in _CONF.rglob("*") if p.is_dir() and p.name != "__pycache__"
+    }
+    chosen = [o for o in overrides if o.key_or_group in groups]
+    for override in chosen:
+        options = [p.stem for p in (_CONF / override.key_or_group).glob("*.yaml")]
+        for value in _values(override):
+            if value not in ("null", "None", None) and str(value) not in options:
+                raise RPGError(f"{override.key_or_group}={value}: unknown; {nearest(str(value), options)}")
+    base = _compose([f"{o.key_or_group}={_values(o)[0]}" for o in chosen])
+    for override in overrides:
+        if override.key_or_group in groups or override.key_or_group.split(".")[0] == "hydra":
+            continue
+        if not (override.is_add() or override.is_force_add()):
+            _require_key(base, override.key_or_group, groups)
+
+
+def _values(override: Override) -> list[Any]:
+    if override.is_sweep_override():
+        return [str(v) for v in override.sweep_string_iterator()]
+    value = override.value()
+    return ["null" if value is None else value]
+
+
+def _compose(overrides: list[str]) -> DictConfig:
+    try:
+        with initialize_config_module("rpg.conf", version_base="1.3"):
+            return compose("config", overrides=overrides)
+    except (HydraException, OmegaConfBaseException) as error:
+        raise RPGError(f"config: {str(error).strip().splitlines()[0]}") from error
+
+
+def _require_key(base: DictConfig, key: str, groups: set[str]) -> None:
+    node: Any = base
+    parts = key.split(".")
+    for depth, part in enumerate(parts):
+        if not OmegaConf.is_dict(node):
+            return
+        if part not in node:
+            if depth and parts[depth - 1] == "kwargs":
+                raise RPGError(
+                    f"{key}: constructor arguments of an environment are added with a plus: +{key}=..."
+                )
+            known = [str(k) for k in node] + (sorted(groups) if depth == 0 else [])
+            where = ".".join(parts[:depth]) or "config"
+            raise RPGError(f"{key}: no key '{part}' in {where}; {nearest(part, set(known))}")
+        node = OmegaConf.to_container(node, resolve=False)[part]  # type: ignore[call-overload,index]
+        node = OmegaConf.create(node) if isinstance(node, dict) else node

@@ -1,0 +1,27 @@
+"""Names under which ``gymnasium.make`` and ``gymnasium.make_vec`` find the environments of this package."""
+
+from __future__ import annotations
+
+import gymnasium
+
+MAZES = {
+    "rpg/GapMaze-v1": "gap_v1",
+    "rpg/SmallMaze-v0": "small",
+    "rpg/SmallSlowMaze-v0": "small_slow",
+    "rpg/MediumMaze-v0": "medium",
+    "rpg/TreeMaze-v0": "tree",
+    "rpg/LargeMaze-v0": "large",
+}
+"""Environment id -> key of :data:`rpg.envs.layouts.LAYOUTS`."""
+
+
+def register_all() -> None:
+    """Register every environment with gymnasium; safe to call again. Nothing heavy is imported."""
+    for env_id, layout in MAZES.items():
+        if env_id not in gymnasium.registry:
+            gymnasium.register(
+                env_id,
+                entry_point="rpg.envs.maze:MazeEnv",
+                vector_entry_point="rpg.envs.maze:MazeVectorEnv",
+                kwargs={"layout": layout},
+            )

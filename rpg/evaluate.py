@@ -1,0 +1,59 @@
+"""Evaluate a trained run: the same code path as the evaluations during training.
+
+rpg-evaluate runs/maze/rpg/seed0
+rpg-evaluate runs/maze/rpg/seed0 --episodes 50 --seed 7
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+from omegaconf import OmegaConf
+
+from rpg.cli import report_errors
+from rpg.envs.make import make_envs
+from rpg.errors import RPGError
+from rpg.training.build import build_agent, parse_config
+from rpg.training.checkpoint import load_checkpoint
+from rpg.training.runner import evaluate, summarize
+
+
+def evaluate_run(run_dir: Path, episodes: int, seed: int, num_envs: int | None = None) -> dict[str, float]:
+    """Load the checkpoint of ``run_dir`` and run whole episodes, with modes and with samples of pi(a|s, z).
+
+    Returns:
+        ``eval/deterministic/...`` and ``eval/stochastic/...`` means.
+
+    Raises:
+        RPGError: not a run folder, or a damaged checkpoint.
+    """
+    state = load_checkpoint(run_dir / "checkpoint.pt")
+    run = parse_config(OmegaConf.create(state["config"]))
+    envs = make_envs(run.env, num_envs or run.trainer.eval_envs)
+    agent, _ = build_agent(run, envs)
+    agent.load_state_dict(state["agent"])
+    result: dict[str, float] = {}
+    for mode, deterministic in (("deterministic", True), ("stochastic", False)):
+        finished = evaluate(agent, envs, episodes, seed, deterministic, run.env.name)
+        result |= summarize(finished, f"eval/{mode}")
+    return result
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Console entry point ``rpg-evaluate``: prints one JSON object."""
+    parser = argparse.ArgumentParser(prog="rpg-evaluate", description="Evaluate a trained run.")
+    parser.add_argument("run", type=Path, help="run folder")
+    parser.add_argument("--episodes", type=int, default=20, help="episodes per mode (default 20)")
+    parser.add_argument("--seed", type=int, default=0, help="equal seeds give equal episodes (default 0)")
+    args = parser.parse_args(argv)
+    with report_errors():
+        if args.episodes < 1:
+            raise RPGError(f"--episodes {args.episodes}: must be at least 1")
+        print(json.dumps({"run": str(args.run), **evaluate_run(args.run, args.episodes, args.seed)}))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

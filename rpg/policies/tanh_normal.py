@@ -1,0 +1,50 @@
+"""The action distribution: a normal squashed into (-1, 1) by tanh (Table 3.1)."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+_LOG_STD_MIN, _LOG_STD_MAX = -20.0, 2.0
+
+
+class TanhNormal:
+    """a = tanh(u), u ~ N(mean, std^2), per action dimension.
+
+    Args:
+        params: (..., 2 * action_dim): mean and raw log-std side by side, as a network emits them.
+        base_std: multiplies exp(log-std); 0.4 in the published runs.
+    """
+
+    def __init__(self, params: Tensor, base_std: float) -> None:
+        self.mean, raw = params.chunk(2, dim=-1)
+        # The clamp passes gradients through, so a saturated log-std can find its way back.
+        clamped = raw + (raw.clamp(_LOG_STD_MIN, _LOG_STD_MAX) - raw).detach()
+        self.log_std = clamped + math.log(base_std)
+
+    @property
+    def mode(self) -> Tensor:
+        """tanh of the mean, (..., action_dim)."""
+        return self.mean.tanh()
+
+    def rsample(self) -> tuple[Tensor, Tensor]:
+        """Draw reparameterized actions (..., action_dim) and their log-density (...)."""
+        noise = torch.randn_like(self.mean)
+        u = self.mean + self.log_std.exp() * noise
+        log_normal = -0.5 * noise.square() - self.log_std - 0.5 * math.log(2 * math.pi)
+        return u.tanh(), (log_normal - _log_tanh_slope(u)).sum(-1)
+
+    def log_prob(self, action: Tensor) -> Tensor:
+        """Log-density (...) of actions (..., action_dim) strictly inside (-1, 1)."""
+        u = action.atanh()
+        standard = (u - self.mean) * torch.exp(-self.log_std)
+        log_normal = -0.5 * standard.square() - self.log_std - 0.5 * math.log(2 * math.pi)
+        return (log_normal - _log_tanh_slope(u)).sum(-1)
+
+
+def _log_tanh_slope(u: Tensor) -> Tensor:
+    """log(1 - tanh(u)^2), stable for large ``|u|``."""
+    return 2.0 * (math.log(2.0) - u - F.softplus(-2.0 * u))

@@ -1,0 +1,187 @@
+"""From Hydra's plain config to a trainer: validate, then assemble."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import ConfigKeyError, MissingMandatoryValue, OmegaConfBaseException
+
+from rpg.agents import RPG, Agent, RPGConfig
+from rpg.agents.scripted import SCRIPTED, make_scripted
+from rpg.envs.config import EnvConfig
+from rpg.envs.make import declared_objects, make_envs
+from rpg.errors import CheckpointError, RPGError, nearest
+from rpg.exploration import ObjectsOfInterest, RandomNetworkDistillation, RNDConfig
+from rpg.training.checkpoint import load_checkpoint
+from rpg.training.config import LoggerConfig, RunConfig, TrainerConfig
+from rpg.training.loggers import Loggers, Sink, TensorBoardSink, WandbSink
+from rpg.training.trainer import Trainer
+
+LEARNERS = ("rpg", "mbsac")
+
+
+def parse_config(cfg: DictConfig) -> RunConfig:
+    """Check every section against its dataclass.
+
+    Raises:
+        RPGError: an unknown key, a wrong type or an impossible value, in one line.
+    """
+    plain = _plain(cfg)
+    agent = dict(plain["agent"])
+    name = agent.pop("name", None)
+    if name not in (*LEARNERS, *SCRIPTED):
+        raise RPGError(f"agent.name={name!r}: unknown agent; {nearest(str(name), (*LEARNERS, *SCRIPTED))}")
+    learner = name in LEARNERS
+    model = {"world_model": plain["world_model"]} if learner else {}
+    exploration = dict(plain["exploration"])
+    exploration_name = exploration.pop("name", None)
+    if exploration_name not in ("rnd", "none"):
+        raise RPGError(f"exploration.name={exploration_name!r}: choose rnd or none")
+    threads = plain["threads"]
+    if threads is not None and (not isinstance(threads, int) or threads < 1):
+        raise RPGError(f"threads={threads!r}: a whole number of at least 1, or null")
+    if not isinstance(plain["seed"], int) or plain["seed"] < 0:
+        raise RPGError(f"seed={plain['seed']!r}: must be a whole number, not negative")
+    return RunConfig(
+        agent_name=name,
+        agent=_section(RPGConfig, {**agent, **model}, "agent") if learner else RPGConfig(),
+        agent_options={} if learner else agent,
+        exploration_name=exploration_name if learner else "none",
+        exploration=_section(RNDConfig, exploration, "exploration")
+        if exploration_name == "rnd"
+        else RNDConfig(),
+        env=_section(EnvConfig, plain["env"], "env"),
+        trainer=_section(TrainerConfig, plain["trainer"], "trainer"),
+        logger=_section(LoggerConfig, plain["logger"], "logger"),
+        seed=plain["seed"],
+        device=_device(plain["device"]),
+        threads=threads,
+        run_dir=plain["run_dir"],
+        plain=plain,
+    )
+
+
+def _plain(cfg: DictConfig) -> dict[str, Any]:
+    try:
+        plain = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
+    except MissingMandatoryValue as error:
+        raise RPGError(f"config: {_first_line(error)}; give it on the command line") from error
+    except OmegaConfBaseException as error:
+        raise RPGError(f"config: {_first_line(error)}") from error
+    assert isinstance(plain, dict)
+    return {str(k): v for k, v in plain.items()}
+
+
+def _section(schema: type[Any], values: dict[str, Any], where: str) -> Any:
+    try:
+        return OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(schema), values))
+    except ConfigKeyError as error:
+        key = str(error.full_key or error.key)
+        parent: Any = OmegaConf.select(OmegaConf.structured(schema), ".".join(key.split(".")[:-1]) or "")
+        known = [str(k) for k in (parent if parent is not None else OmegaConf.structured(schema))]
+        raise RPGError(f"{where}.{key}: unknown key; {nearest(key.split('.')[-1], known)}") from error
+    except OmegaConfBaseException as error:
+        raise RPGError(f"{where}.{error.full_key}: {_first_line(error)}") from error
+
+
+def _first_line(error: BaseException) -> str:
+    return str(error).strip().splitlines()[0]
+
+
+def _device(name: str) -> str:
+    if name == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    try:
+        device = torch.device(name)
+    except RuntimeError as error:
+        raise RPGError(f"device={name!r}: choose auto, cpu or cuda") from error
+    if device.type == "cuda" and not torch.cuda.is_available():
+        raise RPGError(f"device={name!r}: no usable GPU here; choose device=cpu or auto")
+    return name
+
+
+def build_agent(run: RunConfig, envs: Any) -> tuple[Agent, ObjectsOfInterest]:
+    """Make the agent for these environments, and the objects of interest it was told of."""
+    obs_space, action_space = envs.single_observation_space, envs.single_action_space
+    if run.agent_name in SCRIPTED:
+        agent: Agent = make_scripted(run.agent_name, obs_space, action_space, run.device, **run.agent_options)
+        return agent, ObjectsOfInterest.of(())
+    Agent(obs_space, action_space)  # spaces are checked before their shape is used
+    objects = declared_objects(envs) or ObjectsOfInterest.everything(obs_space.shape[0])
+    return RPG(obs_space, action_space, run.agent, objects, run.device), objects
+
+
+def build_trainer(run: RunConfig) -> Trainer:
+    """Make everything a run needs. Seeds torch and sets its thread count.
+
+    Raises:
+        RPGError: a bad setting, a missing package, or a run folder that cannot be written.
+    """
+    if run.threads is not None:
+        torch.set_num_threads(run.threads)
+    torch.manual_seed(run.seed)
+    np.random.seed(run.seed)  # some gymnasium environments draw from numpy's global generator
+    envs = make_envs(run.env)
+    agent, objects = build_agent(run, envs)
+    exploration = None
+    if run.exploration_name == "rnd":
+        exploration = RandomNetworkDistillation(objects, run.exploration, run.device)
+    run_dir = Path(run.run_dir)
+    return Trainer(
+        agent=agent,
+        exploration=exploration,
+        envs=envs,
+        eval_envs=lambda: make_envs(run.env, run.trainer.eval_envs),
+        config=run.trainer,
+        run_dir=run_dir,
+        loggers=Loggers(run_dir, _sinks(run, run_dir)),
+        seed=run.seed,
+        plain_config=run.plain,
+        env_name=run.env.name,
+        action_repeat=run.env.action_repeat,
+    )
+
+
+def _sinks(run: RunConfig, run_dir: Path) -> list[Sink]:
+    sinks: list[Sink] = []
+    if run.logger.tensorboard:
+        sinks.append(TensorBoardSink(run_dir))
+    if run.logger.wandb:
+        sinks.append(WandbSink(run_dir, run.logger.wandb_project, run.plain))
+    return sinks
+
+
+# Settings that may change between restarts without making it another run.
+_FREE = ("trainer.steps", "trainer.checkpoint_every", "device", "threads", "run_dir", "logger")
+
+
+def require_same_run(path: Path, run: RunConfig) -> dict[str, Any]:
+    """Load ``path`` and make sure that it belongs to ``run``.
+
+    Raises:
+        CheckpointError: unreadable, or made by another configuration; names the first difference.
+    """
+    state = load_checkpoint(path)
+    stored, wanted = _flatten(state["config"]), _flatten(run.plain)
+    for key in sorted(stored.keys() | wanted.keys()):
+        if key.startswith(_FREE):
+            continue
+        if stored.get(key) != wanted.get(key):
+            raise CheckpointError(
+                f"run folder {path.parent}: holds a run with {key}={stored.get(key)}, asked for "
+                f"{wanted.get(key)}; choose another run_dir or the same settings"
+            )
+    return state
+
+
+def _flatten(tree: Any, prefix: str = "") -> dict[str, Any]:
+    if not isinstance(tree, dict):
+        return {prefix[:-1]: tree}
+    flat: dict[str, Any] = {}
+    for key, value in tree.items():
+        flat |= _flatten(value, f"{prefix}{key}.")
+    return flat

@@ -1,0 +1,60 @@
+"""Checkpoints: one file of tensors and plain data, written so that a crash leaves a readable one."""
+
+from __future__ import annotations
+
+import os
+import pickle
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from rpg.errors import CheckpointError, RPGError
+
+FORMAT = "rpg-checkpoint"
+VERSION = 1
+
+
+def save_checkpoint(path: Path, content: dict[str, Any]) -> None:
+    """Write ``content`` atomically: temporary name, fsync, rename.
+
+    Raises:
+        RPGError: the disk is full or the folder cannot be written; an earlier checkpoint stays intact.
+    """
+    temporary = path.with_suffix(".tmp")
+    try:
+        with temporary.open("wb") as file:
+            torch.save({"format": FORMAT, "version": VERSION, **content}, file)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except (OSError, RuntimeError) as error:
+        temporary.unlink(missing_ok=True)
+        reason = " ".join(str(error).split())
+        raise RPGError(
+            f"checkpoint {path}: cannot be written ({reason}); free space or choose another run_dir, "
+            "the previous checkpoint is intact"
+        ) from error
+
+
+def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
+    """Read a checkpoint without running any code from it.
+
+    Raises:
+        CheckpointError: missing, damaged, or not one of ours.
+    """
+    remedy = "move it away to start afresh, or choose another run_dir"
+    try:
+        content = torch.load(path, map_location=device, weights_only=True)
+    except FileNotFoundError as error:
+        raise CheckpointError(f"checkpoint {path}: no such file; is this a run folder?") from error
+    except (OSError, RuntimeError, ValueError, KeyError, EOFError, pickle.UnpicklingError) as error:
+        # Torch's own message may suggest to load without safety; it is not repeated.
+        raise CheckpointError(f"checkpoint {path}: damaged, or not written by rpg; {remedy}") from error
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise CheckpointError(f"checkpoint {path}: not written by rpg; {remedy}")
+    if content.get("version") != VERSION:
+        raise CheckpointError(
+            f"checkpoint {path}: format version {content.get('version')}, this rpg reads {VERSION}; {remedy}"
+        )
+    return content

@@ -1,0 +1,76 @@
+"""The run's settings as dataclasses: what Hydra's plain config must look like."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from rpg.agents.config import RPGConfig
+from rpg.envs.config import EnvConfig
+from rpg.errors import RPGError
+from rpg.exploration.rnd import RNDConfig
+
+
+@dataclass
+class TrainerConfig:
+    """The loop. Every interval is in env steps (simulator steps, action repeat included).
+
+    Args:
+        steps: env steps to train for.
+        seed_decisions: decisions taken before the first agent update (1000 in Table 3.1).
+        decisions_per_update: decisions per gradient update (5 in Table 3.1); 0 never learns.
+        replay_capacity: transitions kept.
+        log_every: between log rows.
+        eval_every: between evaluations; 0 never.
+        eval_episodes: per evaluation and mode.
+        eval_envs: sub-environments of the evaluation.
+        checkpoint_every: between checkpoints.
+        picture_every: between pictures; 0 never.
+    """
+
+    steps: int = 240_000
+    seed_decisions: int = 1000
+    decisions_per_update: int = 5
+    replay_capacity: int = 800_000
+    log_every: int = 1000
+    eval_every: int = 20_000
+    eval_episodes: int = 10
+    eval_envs: int = 5
+    checkpoint_every: int = 10_000
+    picture_every: int = 20_000
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "log_every", "checkpoint_every", "eval_episodes", "eval_envs"):
+            if getattr(self, name) < 1:
+                raise RPGError(f"trainer.{name}={getattr(self, name)}: must be at least 1")
+        for name in ("seed_decisions", "decisions_per_update", "eval_every", "picture_every"):
+            if getattr(self, name) < 0:
+                raise RPGError(f"trainer.{name}={getattr(self, name)}: must not be negative")
+
+
+@dataclass
+class LoggerConfig:
+    """Where metrics go besides ``metrics.jsonl`` and ``progress.csv``, which are always written."""
+
+    tensorboard: bool = True
+    wandb: bool = False
+    wandb_project: str = "rpg"
+
+
+@dataclass
+class RunConfig:
+    """A whole run, validated."""
+
+    agent_name: str
+    agent: RPGConfig
+    agent_options: dict[str, Any]
+    exploration_name: str
+    exploration: RNDConfig
+    env: EnvConfig
+    trainer: TrainerConfig
+    logger: LoggerConfig
+    seed: int
+    device: str
+    threads: int | None
+    run_dir: str
+    plain: dict[str, Any] = field(default_factory=dict)

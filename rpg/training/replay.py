@@ -1,0 +1,153 @@
+"""Segment replay in preallocated tensors on the agent's device."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rpg.errors import RPGError
+from rpg.segments import SegmentBatch
+
+
+class SegmentReplay:
+    """A ring of vector steps, one packed float32 row per transition.
+
+    A row holds observation, next observation, action, reward, latent and three flags side by side, so
+    sampling is a single gather. Both observations are kept: the last one of an episode has no successor
+    to be read from.
+
+    Args:
+        obs_dim: length of an observation vector.
+        action_dim: length of an action vector.
+        latent_dim: length of z.
+        num_envs: sub-environments that step together.
+        capacity: transitions kept; rounded down to whole vector steps.
+        device: where the ring lives.
+    """
+
+    def __init__(
+        self,
+        obs_dim: int,
+        action_dim: int,
+        latent_dim: int,
+        num_envs: int,
+        capacity: int = 800_000,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        self._widths = [obs_dim, obs_dim, action_dim, 1, latent_dim, 1, 1, 1]
+        self._num_envs = num_envs
+        self._rows = capacity // num_envs
+        if self._rows < 2:
+            raise RPGError(f"replay capacity={capacity} holds fewer than 2 steps of {num_envs} environments")
+        self._data = torch.empty(self._rows, num_envs, sum(self._widths), device=device)
+        self._head = 0  # next row to write
+        self._filled = 0  # rows that hold data
+        self._episode_step = torch.zeros(num_envs, 1, device=device)
+        self._ends = sum(self._widths[:6])  # column: did the episode end (either way) after this step
+
+    def __len__(self) -> int:
+        """Transitions stored."""
+        return self._filled * self._num_envs
+
+    def add(
+        self,
+        obs: np.ndarray | Tensor,
+        action: np.ndarray | Tensor,
+        reward: np.ndarray | Tensor,
+        next_obs: np.ndarray | Tensor,
+        terminated: np.ndarray | Tensor,
+        truncated: np.ndarray | Tensor,
+        latent: Tensor,
+    ) -> None:
+        """Store one vector step; every argument has ``num_envs`` rows.
+
+        ``next_obs`` is the true successor, also where the episode ended (not the next reset).
+        """
+        ended = self._column(terminated) + self._column(truncated) > 0
+        row = self._data[self._head]
+        torch.cat(
+            [
+                self._matrix(obs),
+                self._matrix(next_obs),
+                self._matrix(action),
+                self._column(reward),
+                latent.to(row),
+                self._column(terminated),
+                ended.to(row),
+                self._episode_step,
+            ],
+            dim=1,
+            out=row,
+        )
+        self._episode_step = torch.where(ended, 0.0, self._episode_step + 1)
+        self._head = (self._head + 1) % self._rows
+        self._filled = min(self._filled + 1, self._rows)
+
+    def cut(self) -> None:
+        """Close all running episodes as truncated: their environments could not be restored."""
+        if self._filled:
+            self._data[self._head - 1, :, self._ends] = 1.0
+        self._episode_step.zero_()
+
+    def sample(self, batch_size: int, horizon: int) -> SegmentBatch:
+        """Draw ``batch_size`` segments of ``horizon`` steps, uniform over stored transitions."""
+        if not self._filled:
+            raise RPGError("replay is empty: add transitions before sampling")
+        device = self._data.device
+        age = torch.randint(self._filled, (batch_size,), device=device)  # 0 is the oldest row
+        env = torch.randint(self._num_envs, (batch_size,), device=device)
+        steps = torch.arange(horizon, device=device).unsqueeze(1)
+        ages = age + steps  # (K, N)
+        oldest = self._head - self._filled
+        # Beyond the newest row nothing is known yet: such steps are masked like those after an ending.
+        rows = (oldest + ages.clamp(max=self._filled - 1)) % self._rows
+        picked = self._data[rows, env]  # (K, N, width)
+        ended = picked[:-1, :, self._ends] > 0
+        begun = torch.ones(1, batch_size, dtype=torch.bool, device=device)
+        alive = torch.cat([begun, ~ended]).cumprod(0)
+        mask = alive * (ages < self._filled)
+        # Steps outside the episode repeat its last transition, so no value from elsewhere can leak in.
+        last = mask.sum(0, keepdim=True) - 1
+        picked = picked.gather(0, torch.minimum(steps, last).unsqueeze(-1).expand_as(picked))
+        obs, next_obs, action, reward, latent, terminated, _, step = picked.split(self._widths, dim=-1)
+        return SegmentBatch(
+            obs=obs[0],
+            next_obs=next_obs,
+            action=action,
+            reward=reward.squeeze(-1),
+            terminated=terminated.squeeze(-1),
+            mask=mask.to(picked.dtype),
+            latent=latent[0],
+            step=step[0, :, 0],
+        )
+
+    def state_dict(self) -> dict[str, Any]:
+        """Tensors and plain data only; of the ring only what is filled."""
+        return {
+            "data": self._data[: self._filled].clone(),
+            "head": self._head,
+            "episode_step": self._episode_step.clone(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from :meth:`state_dict` of a replay of the same shape."""
+        data = state["data"]
+        if data.shape[1:] != self._data.shape[1:] or len(data) > self._rows:
+            raise RPGError(
+                f"replay: stored rows {tuple(data.shape)} do not fit into {tuple(self._data.shape)}; "
+                "resume with the same environment, latent space, num_envs and capacity"
+            )
+        self._data[: len(data)] = data
+        self._filled = len(data)
+        self._head = state["head"]
+        self._episode_step.copy_(state["episode_step"])
+
+    def _matrix(self, values: np.ndarray | Tensor) -> Tensor:
+        tensor = torch.as_tensor(values, dtype=torch.float32, device=self._data.device)
+        return tensor.reshape(self._num_envs, -1)
+
+    def _column(self, values: np.ndarray | Tensor) -> Tensor:
+        return self._matrix(values)

@@ -1,0 +1,311 @@
+"""The training loop: collect, learn, tell, survive."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium.vector import VectorEnv
+from torch import Tensor
+
+from rpg.agents.agent import Agent
+from rpg.envs.base import Restorable, Tracked
+from rpg.errors import NonFiniteError
+from rpg.exploration import RandomNetworkDistillation
+from rpg.training.checkpoint import load_checkpoint, save_checkpoint
+from rpg.training.config import TrainerConfig
+from rpg.training.loggers import Loggers
+from rpg.training.replay import SegmentReplay
+from rpg.training.runner import Episode, Runner, evaluate, summarize
+
+Row = dict[str, float | int | str]
+
+
+class Trainer:
+    """Trains one agent in one batch of environments, resumably.
+
+    Args:
+        agent: acts and learns.
+        exploration: bonus on sampled segments; None for none.
+        envs: training environments.
+        eval_envs: makes a separate batch for evaluation when first needed.
+        config: the loop.
+        run_dir: logs, pictures and the checkpoint go here.
+        loggers: where rows and pictures go.
+        seed: of the run.
+        plain_config: the whole run's settings as plain data, stored in the checkpoint.
+        env_name: for messages.
+        action_repeat: env steps per decision.
+    """
+
+    def __init__(
+        self,
+        agent: Agent,
+        exploration: RandomNetworkDistillation | None,
+        envs: VectorEnv[Any, Any, Any],
+        eval_envs: Callable[[], VectorEnv[Any, Any, Any]],
+        config: TrainerConfig,
+        run_dir: Path,
+        loggers: Loggers,
+        seed: int,
+        plain_config: dict[str, Any] | None = None,
+        env_name: str = "env",
+        action_repeat: int = 1,
+    ) -> None:
+        self.agent, self.exploration, self.config = agent, exploration, config
+        self.checkpoint_path = run_dir / "checkpoint.pt"
+        self._make_eval_envs = eval_envs
+        self._eval_envs: VectorEnv[Any, Any, Any] | None = None
+        self._loggers, self._seed, self._plain = loggers, seed, plain_config or {}
+        self._env_name, self._repeat = env_name, action_repeat
+        self._restorable = isinstance(envs, Restorable)
+        self._runner = Runner(agent, envs, seed, env_name)
+        self._replay = SegmentReplay(
+            agent.obs_dim,
+            agent.action_dim,
+            agent.latent_dim,
+            envs.num_envs,
+            config.replay_capacity,
+            agent.device,
+        )
+        self._tracker = envs.make_tracker() if isinstance(envs, Tracked) else None
+        self.decisions = self.updates = self._ticks = 0
+        self._sums: dict[str, Tensor] = {}
+        self._counts: dict[str, int] = {}
+        self._episodes: list[Episode] = []
+        self._last_row: Row = {}
+        self._due_checkpoint = False
+        self._wall_before, self._clock = 0.0, time.perf_counter()
+        self._speed = (0, 0, 0.0)  # decisions, updates, wall_s at the last log row
+
+    @property
+    def env_steps(self) -> int:
+        """Simulator steps so far, action repeat included."""
+        return self.decisions * self._repeat
+
+    @property
+    def wall_s(self) -> float:
+        """Seconds of training, summed over restarts."""
+        return self._wall_before + time.perf_counter() - self._clock
+
+    def train(
+        self,
+        should_stop: Callable[[], bool] = lambda: False,
+        on_row: Callable[[Row], None] = lambda row: None,
+    ) -> Row:
+        """Run until ``config.steps``, or until ``should_stop`` asks to; either way a checkpoint is written.
+
+        Args:
+            should_stop: looked at after every vector step.
+            on_row: receives every log row, for a progress display.
+
+        Returns:
+            The last row logged.
+        """
+        self._clock = time.perf_counter()
+        if self.decisions == 0:
+            self.start()
+        while self.env_steps < self.config.steps and not should_stop():
+            self.collect_once()
+            while self._ticks < self._ticks_due():
+                self._ticks += 1
+                self.learn_once()
+            if self._due(self.config.eval_every):
+                self._evaluate()
+            if self._due(self.config.log_every):
+                on_row(self._log())
+            if self._due(self.config.picture_every):
+                self.draw()
+            self._due_checkpoint |= self._due(self.config.checkpoint_every)
+            # Episodes of a simulator that cannot be restored are not torn apart by a checkpoint.
+            if self._due_checkpoint and (self._restorable or self._runner.at_boundary):
+                self.save()
+        if self.env_steps >= self.config.steps:
+            self.draw()
+        self.save()
+        return self._last_row
+
+    def _due(self, every: int) -> bool:
+        """Whether the last vector step reached a multiple of ``every`` env steps, or the end."""
+        if not every:
+            return False
+        before = self.env_steps - self._runner.num_envs * self._repeat
+        return self.env_steps // every > before // every or self.env_steps >= self.config.steps > before
+
+    # -- collect and learn -----------------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Begin the first episodes."""
+        self._runner.reset()
+        self._watch(self._runner.observations)
+
+    def collect_once(self) -> None:
+        """Act once in every environment and store what happened."""
+        transition, episodes = self._runner.step()
+        self._replay.add(*transition)
+        self._watch(transition.next_obs)
+        if episodes:
+            self._watch(self._runner.observations)
+            self._episodes += episodes
+        self.decisions += self._runner.num_envs
+
+    def _watch(self, observations: np.ndarray) -> None:
+        if self._tracker is not None:
+            self._tracker.observe(observations)
+        if self.exploration is not None:
+            self.exploration.observe(torch.as_tensor(observations, device=self.agent.device))
+
+    def _ticks_due(self) -> int:
+        if not self.config.decisions_per_update or not self.agent.batch_size:
+            return 0
+        return self.decisions // self.config.decisions_per_update
+
+    def learn_once(self) -> None:
+        """One update of the exploration bonus and, once enough is stored, of the agent."""
+        if self.exploration is not None and self.exploration.ready:
+            self._add(self.exploration.update())
+        if self.decisions > self.config.seed_decisions:
+            batch = self._replay.sample(self.agent.batch_size, self.agent.horizon)
+            if self.exploration is not None:
+                batch = self.exploration.relabel(batch)
+            self._add(self.agent.update(batch, self.env_steps))
+            self.updates += 1
+
+    def _add(self, metrics: dict[str, Tensor]) -> None:
+        # Sums stay on the device; they are read once per log row.
+        for key, value in metrics.items():
+            self._sums[key] = self._sums[key] + value if key in self._sums else value.clone()
+            self._counts[key] = self._counts.get(key, 0) + 1
+
+    # -- tell ------------------------------------------------------------------------------------------
+
+    def _progress(self) -> Row:
+        return {
+            "decisions": self.decisions,
+            "env_steps": self.env_steps,
+            "updates": self.updates,
+            "wall_s": round(self.wall_s, 3),
+        }
+
+    def _log(self) -> Row:
+        row = self._progress()
+        if self._tracker is not None:
+            row |= {f"train/{k}": v for k, v in self._tracker.metrics().items()}
+        row |= summarize(self._episodes, "train")
+        means = {key: float(self._sums[key]) / self._counts[key] for key in sorted(self._sums)}
+        row |= means
+        wall = self.wall_s
+        elapsed = max(wall - self._speed[2], 1e-9)
+        row["time/env_steps_per_s"] = (self.decisions - self._speed[0]) * self._repeat / elapsed
+        row["time/updates_per_s"] = (self.updates - self._speed[1]) / elapsed
+        self._speed = (self.decisions, self.updates, wall)
+        self._sums, self._counts, self._episodes = {}, {}, []
+        self._loggers.log(row, self.env_steps)
+        self._last_row = self._last_row | row
+        bad = [key for key, value in means.items() if not np.isfinite(value)]
+        if bad:
+            raise NonFiniteError(
+                f"{self._env_name}: {', '.join(bad)} became non-finite by env step {self.env_steps} "
+                f"(seed {self._seed}); the last checkpoint is untouched, lower the learning rate or look at "
+                "the rewards"
+            )
+        return row
+
+    def _evaluate(self) -> None:
+        if self._eval_envs is None:
+            self._eval_envs = self._make_eval_envs()
+        row = self._progress()
+        for mode, deterministic in (("deterministic", True), ("stochastic", False)):
+            episodes = evaluate(
+                self.agent,
+                self._eval_envs,
+                self.config.eval_episodes,
+                self._seed,
+                deterministic,
+                self._env_name,
+            )
+            row |= summarize(episodes, f"eval/{mode}")
+        self._loggers.log(row, self.env_steps)
+        self._last_row = self._last_row | row
+
+    def draw(self) -> None:
+        """Write the tracker's picture of progress, if it has one."""
+        picture = self._tracker.picture() if self._tracker is not None else None
+        if picture is not None:
+            self._loggers.picture("progress", picture, self.env_steps)
+
+    # -- survive ---------------------------------------------------------------------------------------
+
+    def save(self) -> None:
+        """Write the checkpoint; refuses if learning has gone non-finite since the last one."""
+        bad = [key for key, value in self._sums.items() if not bool(value.isfinite())]
+        if bad:
+            raise NonFiniteError(
+                f"{self._env_name}: {', '.join(bad)} became non-finite by env step {self.env_steps} "
+                f"(seed {self._seed}); no checkpoint was written, the previous one is untouched"
+            )
+        save_checkpoint(self.checkpoint_path, self.state_dict())
+        self._due_checkpoint = False
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything the run depends on, as tensors and plain data."""
+        tracker = self._tracker.state_dict() if self._tracker is not None else {}
+        cuda = self.agent.device.type == "cuda"
+        return {
+            "config": self._plain,
+            "decisions": self.decisions,
+            "env_steps": self.env_steps,
+            "updates": self.updates,
+            "ticks": self._ticks,
+            "wall_s": self.wall_s,
+            "agent": self.agent.state_dict(),
+            "exploration": self.exploration.state_dict() if self.exploration is not None else {},
+            "replay": self._replay.state_dict(),
+            "runner": self._runner.state_dict(),
+            "episode_state": self.agent.episode_state(),
+            "tracker": {
+                k: torch.as_tensor(v) if isinstance(v, np.ndarray) else v for k, v in tracker.items()
+            },
+            "sums": dict(self._sums),
+            "counts": dict(self._counts),
+            "episodes": [tuple(e) for e in self._episodes],
+            "last_row": dict(self._last_row),
+            "rng": torch.get_rng_state(),
+            "cuda_rng": torch.cuda.get_rng_state(self.agent.device) if cuda else None,
+        }
+
+    def resume(self) -> bool:
+        """Continue from this run's checkpoint.
+
+        Returns:
+            True if running episodes were restored too; False if new ones had to begin.
+        """
+        state = load_checkpoint(self.checkpoint_path, self.agent.device)
+        self.decisions, self.updates, self._ticks = state["decisions"], state["updates"], state["ticks"]
+        self._wall_before, self._clock = state["wall_s"], time.perf_counter()
+        self._speed = (self.decisions, self.updates, self._wall_before)
+        self.agent.load_state_dict(state["agent"])
+        if self.exploration is not None:
+            self.exploration.load_state_dict(state["exploration"])
+        self._replay.load_state_dict(state["replay"])
+        if self._tracker is not None:
+            self._tracker.load_state_dict(
+                {k: v.cpu().numpy() if isinstance(v, Tensor) else v for k, v in state["tracker"].items()}
+            )
+        self._sums, self._counts = state["sums"], state["counts"]
+        self._episodes = [Episode(*e) for e in state["episodes"]]
+        self._last_row = state["last_row"]
+        self.agent.restore_episode_state(state["episode_state"])
+        torch.set_rng_state(state["rng"].cpu())
+        if state["cuda_rng"] is not None:
+            torch.cuda.set_rng_state(state["cuda_rng"].cpu(), self.agent.device)
+        restored = self._runner.load_state_dict(state["runner"])
+        if not restored:
+            self._replay.cut()
+            self._watch(self._runner.observations)
+        self._loggers.rewind(self.env_steps)
+        return restored

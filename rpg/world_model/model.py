@@ -1,0 +1,69 @@
+"""Encoder, latent dynamics, reward and value; no decoder back to observations (Sec. 3.3.3, Fig. 3.3 B)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from rpg.networks import TwinMLP, mlp
+from rpg.world_model.config import WorldModelConfig
+
+
+class WorldModel(nn.Module):
+    """s = f(o), s' = h(s, a), r = R(s', a) and twin values.
+
+    The dynamics are a GRU that carries its own hidden state from the first encoded state of a rollout
+    and reads out a latent state at each step; the reward head looks at the state *reached*.
+
+    Args:
+        input_dim: width of the (already scaled and encoded) observation.
+        action_dim: number of action dimensions.
+        latent_dim: width of z, which only the value heads see.
+        config: sizes.
+    """
+
+    def __init__(self, input_dim: int, action_dim: int, latent_dim: int, config: WorldModelConfig) -> None:
+        super().__init__()
+        state, width, act = config.state_dim, config.width, config.activation
+        self.critic = config.critic
+        self.encoder = mlp(input_dim, width, state, act)
+        self.action_encoder = mlp(action_dim, width, width, act)
+        self.start = mlp(state, width, width, act)
+        self.gru = nn.GRUCell(width, width)
+        self.readout = mlp(width, width, state, act)
+        self.reward_head = mlp(state + width, width, 1, act)
+        critic_dim = state + latent_dim + (width if config.critic == "q" else 0)
+        self.value_heads = TwinMLP(critic_dim, width, act)
+
+    def unroll(self, state: Tensor, embedded_actions: Tensor) -> Tensor:
+        """Latent states after each of a given sequence of actions.
+
+        Args:
+            state: (N, state_dim), the encoded first state.
+            embedded_actions: (H, N, width) from :attr:`action_encoder`.
+
+        Returns:
+            (H, N, state_dim).
+        """
+        hidden = self.start(state)
+        hiddens = []
+        for embedded in embedded_actions:
+            hidden = self.gru(embedded, hidden)
+            hiddens.append(hidden)
+        states: Tensor = self.readout(torch.stack(hiddens))
+        return states
+
+    def reward(self, next_state: Tensor, embedded_action: Tensor) -> Tensor:
+        """Predicted reward (...) of reaching ``next_state`` by an action."""
+        out: Tensor = self.reward_head(torch.cat([next_state, embedded_action], dim=-1))
+        return out.squeeze(-1)
+
+    def value(self, state: Tensor, latent: Tensor) -> Tensor:
+        """V_i(s, z) for both heads, shape (2, ...); for ``critic="v"``."""
+        out: Tensor = self.value_heads(torch.cat([state, latent], dim=-1))
+        return out
+
+    def q_value(self, state: Tensor, embedded_action: Tensor, latent: Tensor) -> Tensor:
+        """Q_i(s, a, z) for both heads, shape (2, ...); for ``critic="q"``."""
+        out: Tensor = self.value_heads(torch.cat([state, embedded_action, latent], dim=-1))
+        return out
