@@ -18,9 +18,10 @@ from pathlib import Path
 
 import torch
 from hydra import compose, initialize_config_module
-from machine import commit, cpu_name, matmul_gflops, seconds
+from machine import matmul_gflops, seconds
 from torch.utils.flop_counter import FlopCounterMode
 
+from rpg.provenance import commit, cpu_name
 from rpg.training.build import build_trainer, parse_config
 
 

@@ -10,6 +10,7 @@ The same command resumes a run that was interrupted.
 
 from __future__ import annotations
 
+import json
 import signal
 import sys
 import time
@@ -22,6 +23,7 @@ import hydra
 from omegaconf import DictConfig, OmegaConf
 
 from rpg.cli import check_overrides, command_line, report_errors
+from rpg.provenance import provenance
 from rpg.training.build import build_trainer, parse_config, require_same_run
 from rpg.training.loggers import write_atomic
 from rpg.training.progress import Progress
@@ -43,6 +45,7 @@ def assemble(cfg: DictConfig) -> tuple[Trainer, Progress]:
         require_same_run(checkpoint, run)
     trainer = build_trainer(run)
     write_atomic(Path(run.run_dir) / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(run.plain)).encode())
+    write_atomic(Path(run.run_dir) / "run.json", json.dumps(provenance(), indent=2).encode())
     progress = Progress(run.trainer.steps, label=f"{run.agent_name} {run.env.name} seed {run.seed}")
     if resumes:
         restored = trainer.resume()

@@ -96,6 +96,9 @@ class RPGConfig:
         actor_value: which value head the policy climbs: ``first`` (published), ``mean`` or ``min``.
         entropy_in_target: whether value targets contain -alpha log pi (the published runs left it out).
         base_std: action std at log-std 0.
+        noise_correlation: correlation of the action noise from one decision to the next while acting. 0 is
+            independent noise, as published. Above 0 a deviation lasts, so it leads somewhere; the density
+            of each single action stays that of pi(a|s, z), and learning is unchanged.
         alpha: initial entropy weight.
         tune_alpha: adapt alpha to the entropy target.
         entropy_target: in nats; None for -|A|.
@@ -125,6 +128,7 @@ class RPGConfig:
     actor_value: str = "first"
     entropy_in_target: bool = False
     base_std: float = 0.4
+    noise_correlation: float = 0.0
     alpha: float = 0.01
     tune_alpha: bool = True
     entropy_target: float | None = None
@@ -146,6 +150,8 @@ class RPGConfig:
         for name in ("batch_size", "width", "actor_every", "actor_horizon", "target_horizon"):
             if getattr(self, name) < 1:
                 raise RPGError(f"agent.{name}={getattr(self, name)}: must be at least 1")
+        if not 0 <= self.noise_correlation < 1:
+            raise RPGError(f"agent.noise_correlation={self.noise_correlation}: must lie in [0, 1)")
         if not 0 <= self.gamma <= 1:
             raise RPGError(f"agent.gamma={self.gamma}: must lie in [0, 1]")
         if self.alpha < 0 or self.beta < 0 or self.lr <= 0 or self.grad_clip <= 0:

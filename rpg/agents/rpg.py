@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from typing import Any
 
 import gymnasium as gym
@@ -61,6 +62,7 @@ class RPG(Agent):
         self.prior = LatentPrior(self.space, state_dim, self.obs_dim, cfg, self.device)
         self._log_alpha = nn.Parameter(torch.zeros((), device=self.device))
         self._log_beta = nn.Parameter(torch.zeros((), device=self.device))
+        self._noise = torch.zeros(0, self.action_dim, device=self.device)
         self._updates = 0
         self._actor_weights = horizon_weights(cfg.actor_horizon, cfg.horizon_decay)
         self._target_weights = horizon_weights(cfg.target_horizon, cfg.horizon_decay)
@@ -81,7 +83,7 @@ class RPG(Agent):
     @property
     def alpha(self) -> Tensor:
         """Entropy weight: the initial value times exp of a tuned exponent."""
-        return (self.config.alpha * self._log_alpha.detach().exp()).clamp(max=self.config.max_alpha)
+        return self.config.alpha * self._log_alpha.detach().exp()
 
     @property
     def beta(self) -> Tensor:
@@ -94,6 +96,11 @@ class RPG(Agent):
     def begin_episodes(self, obs: Tensor, mask: Tensor, latent: Tensor) -> Tensor:
         """See :meth:`Agent.begin_episodes`; a learned pi(z|s1) also remembers the start states."""
         self.prior.remember(obs[mask])
+        if self.config.noise_correlation:
+            fresh = torch.randn(len(obs), self.action_dim, device=self.device)
+            if len(self._noise) != len(obs):
+                self._noise = fresh
+            self._noise = torch.where(mask.unsqueeze(1), fresh, self._noise)
         return super().begin_episodes(obs, mask, latent)
 
     @torch.no_grad()
@@ -106,7 +113,27 @@ class RPG(Agent):
     def act(self, obs: Tensor, latent: Tensor, deterministic: bool = False) -> Tensor:
         """Draw a ~ pi(a|s, z), or take the mode of pi(.|s, z)."""
         distribution = self.policy(self.model.encoder(self._input(obs)), latent)
-        return self.to_env(distribution.mode if deterministic else distribution.rsample()[0])
+        if deterministic:
+            return self.to_env(distribution.mode)
+        return self.to_env(distribution.rsample(self._next_noise(len(obs)))[0])
+
+    def _next_noise(self, n: int) -> Tensor | None:
+        """The next value of a stationary AR(1) process, or None for independent noise."""
+        rho = self.config.noise_correlation
+        if not rho:
+            return None
+        fresh = torch.randn(n, self.action_dim, device=self.device)
+        # Without begin_episodes there is nothing to be correlated with.
+        self._noise = fresh if len(self._noise) != n else rho * self._noise + math.sqrt(1 - rho**2) * fresh
+        return self._noise
+
+    def episode_state(self) -> dict[str, Tensor]:
+        """The current action noise of every environment."""
+        return {"noise": self._noise.clone()}
+
+    def restore_episode_state(self, state: dict[str, Tensor]) -> None:
+        """Continue from :meth:`episode_state`."""
+        self._noise = state["noise"].clone()
 
     # -- learning --------------------------------------------------------------------------------------
 
@@ -120,7 +147,8 @@ class RPG(Agent):
             if self.prior.learned and self._updates % self.config.prior.every == 0:
                 metrics |= self.prior.update(self._value_of_starts, env_steps)
         if self._updates % self.config.world_model.target_every == 0:
-            torch._foreach_lerp_(self._target_params, self._model_params, self.config.world_model.target_rate)
+            with torch.no_grad():
+                torch._foreach_lerp_(self._target_params, self._model_params, self.config.world_model.target_rate)
         self._updates += 1
         return metrics
 
@@ -215,6 +243,10 @@ class RPG(Agent):
         if loss.requires_grad:
             grads = torch.autograd.grad(loss, self._aux_params, allow_unused=True)
             _step(self._aux_optimizer, self._aux_params, grads, None)
+            if cfg.tune_alpha and cfg.alpha > 0:
+                # Bounded itself, not just where it is read: so it comes back at once when entropy returns.
+                with torch.no_grad():
+                    self._log_alpha.clamp_(max=math.log(cfg.max_alpha / cfg.alpha))
         return metrics
 
     @torch.no_grad()

@@ -55,14 +55,14 @@ class BanditVectorEnv(VectorEnv[Array, Array, Array]):
         RPGError: ``num_envs`` is below 1.
     """
 
-    metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.DISABLED}
+    metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.DISABLED}  # noqa: RUF012 (as gymnasium declares it)
 
     def __init__(self, num_envs: int = 1) -> None:
         if num_envs < 1:
             raise RPGError(f"bandit: num_envs {num_envs} must be at least 1")
         self.num_envs = num_envs
         self.render_mode = None
-        self.single_observation_space = Box(1.0, 1.0, (1,), np.float32)
+        self.single_observation_space = Box(0.0, 1.0, (1,), np.float32)
         self.single_action_space = Box(-1.0, 1.0, (1,), np.float32)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -140,7 +140,7 @@ class BanditVectorEnv(VectorEnv[Array, Array, Array]):
 class BanditEnv(gymnasium.Env[Array, Array]):
     """One bandit: :class:`BanditVectorEnv` with a batch of one, for gymnasium's single-env tools."""
 
-    metadata: dict[str, Any] = {"render_modes": []}
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 (as gymnasium declares it)
 
     def __init__(self, render_mode: None = None) -> None:
         self._batch = BanditVectorEnv(1)

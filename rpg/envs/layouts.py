@@ -111,7 +111,7 @@ def block_walls(half: float, blocks: Iterable[Segment]) -> NDArray[np.float64]:
 
 
 def tree_walls(half: float, branches: int) -> NDArray[np.float64]:
-    """A tree of depth 2: a hall at the bottom, ``branches`` rooms above it, ``branches`` lanes above each room.
+    """A tree of depth 2: a hall at the bottom, ``branches`` rooms above, ``branches`` lanes above each.
 
     The doors of the rooms are 1 wide, those of the lanes half a lane.
     """
@@ -150,7 +150,7 @@ def _gap_v1() -> MazeLayout:
 
 
 def _small(name: str, action_scale: float) -> MazeLayout:
-    # A centre box joined to four corner rooms by diagonal openings 0.5 wide, between the corners of the blocks.
+    # A centre box joined to four corner rooms by diagonal openings 0.5 wide, at the corners of the blocks.
     north, south = (-1.0, 1.0, 1.0, 5.0), (-1.0, -5.0, 1.0, -1.0)
     east, west = (1.5, -1.0, 5.0, 1.0), (-5.0, -1.0, -1.5, 1.0)
     return MazeLayout(

@@ -44,7 +44,7 @@ class Walls:
         self.low, self.high = ends.min(axis=0) - SEAL, ends.max(axis=0) + SEAL
 
     def move(self, position: Floats, step: Floats) -> Floats:
-        """Where points (n, 2) that lie on no wall end up after ``step`` (n, 2), stopping at the first wall."""
+        """Where points (n, 2), on no wall, end up after ``step`` (n, 2), stopping at the first wall."""
         target = position + step
         side_before = position[:, self.axis] - self.line  # (n, walls)
         side_after = target[:, self.axis] - self.line
@@ -106,7 +106,7 @@ class MazeVectorEnv(VectorEnv[Array, Array, Array]):
         RPGError: an unknown layout, or an argument outside its range.
     """
 
-    metadata: dict[str, Any] = {
+    metadata: dict[str, Any] = {  # noqa: RUF012 (as gymnasium declares it)
         "render_modes": ["rgb_array"],
         "render_fps": 15,
         "autoreset_mode": AutoresetMode.DISABLED,
@@ -136,11 +136,9 @@ class MazeVectorEnv(VectorEnv[Array, Array, Array]):
             )
         if render_mode not in (None, "rgb_array"):
             raise RPGError(f"maze: render_mode '{render_mode}' is unknown; use 'rgb_array' or None")
-        self.goal = None if goal is None else np.asarray(goal, dtype=np.float64)
-        if self.goal is not None and (
-            self.goal.shape != (2,) or not (np.abs(self.goal) <= layout.half_size).all()
-        ):
-            raise RPGError(f"maze: goal {goal} must be two numbers within +-{layout.half_size}")
+        self.goal = None if goal is None else _checked_goal(goal, layout)
+        if not goal_radius > 0:
+            raise RPGError(f"maze: goal_radius {goal_radius} must be positive")
         self.goal_radius = goal_radius
         self.render_mode = render_mode
 
@@ -177,7 +175,8 @@ class MazeVectorEnv(VectorEnv[Array, Array, Array]):
             or not mask.any()
         ):
             raise RPGError(
-                f"maze reset: reset_mask {mask!r} must be a bool array of shape ({self.num_envs},), True at least once"
+                f"maze reset: reset_mask {mask!r} must be a bool array of shape ({self.num_envs},), "
+                "True at least once"
             )
         self._position[mask] = self.layout.start
         self._elapsed[mask] = 0
@@ -220,8 +219,8 @@ class MazeVectorEnv(VectorEnv[Array, Array, Array]):
         position = np.array(state["position"], dtype=np.float64)
         if position.shape != self._position.shape:
             raise RPGError(
-                f"maze '{self.layout.name}': the state holds {len(position)} environments, this one {self.num_envs}; "
-                "set num_envs as in the run that saved it"
+                f"maze '{self.layout.name}': the state holds {len(position)} environments, this one "
+                f"{self.num_envs}; set num_envs as in the run that saved it"
             )
         self._position, self._elapsed = position, np.array(state["elapsed"], dtype=np.int64)
 
@@ -238,10 +237,20 @@ class MazeVectorEnv(VectorEnv[Array, Array, Array]):
         return tuple(self._canvas.frame(point) for point in self._position)
 
 
+def _checked_goal(goal: Sequence[float], layout: MazeLayout) -> Floats:
+    try:
+        place = np.asarray(goal, dtype=np.float64)
+    except (TypeError, ValueError):
+        place = np.empty(0)
+    if place.shape != (2,) or not (np.abs(place) <= layout.half_size).all():
+        raise RPGError(f"maze: goal {goal!r} must be two numbers within +-{layout.half_size}")
+    return place
+
+
 class MazeEnv(gymnasium.Env[Array, Array]):
     """One point in a maze: :class:`MazeVectorEnv` with a batch of one, for gymnasium's single-env tools."""
 
-    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 15}
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 15}  # noqa: RUF012
 
     def __init__(
         self,

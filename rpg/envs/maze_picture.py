@@ -108,7 +108,9 @@ def draw_visits(
     right.set_title(f"{int(visits.sum()):,} observations")
 
     for axes in (left, right):
-        axes.add_collection(LineCollection(layout.walls.reshape(-1, 2, 2), colors="#2d3440", linewidths=1.4))
+        axes.add_collection(
+            LineCollection(list(layout.walls.reshape(-1, 2, 2)), colors="#2d3440", linewidths=1.4)
+        )
         axes.plot(*layout.start, marker="+", color="#d64541", markersize=8, markeredgewidth=1.6)
         axes.set(xlim=(-half * MARGIN, half * MARGIN), ylim=(-half * MARGIN, half * MARGIN), aspect="equal")
         axes.set_axis_off()

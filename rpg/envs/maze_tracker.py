@@ -60,7 +60,7 @@ class MazeTracker:
         return {"coverage": float(self.units_visited.mean()), "cells": float(self.cells_visited.mean())}
 
     def picture(self) -> Frame:
-        """Visited cells with the run's states coloured by time, beside the log visitation counts: uint8 (H, W, 3)."""
+        """Visited cells and states coloured by time, beside log visitation counts: uint8 (H, W, 3)."""
         self._flush()
         return draw_visits(self.layout, self.units_visited, self.visits, self.trail, self.trail_index)
 
@@ -86,8 +86,8 @@ class MazeTracker:
         for name in ("units_visited", "cells_visited", "visits"):
             if np.shape(state[name]) != getattr(self, name).shape:
                 raise CheckpointError(
-                    f"maze tracker: '{name}' of shape {np.shape(state[name])} does not fit maze '{self.layout.name}' "
-                    f"({getattr(self, name).shape}); choose the layout that the run was started with"
+                    f"maze tracker: '{name}' of shape {np.shape(state[name])} does not fit maze "
+                    f"'{self.layout.name}' {getattr(self, name).shape}; choose the layout that the run was started with"
                 )
         self.units_visited = np.array(state["units_visited"], dtype=np.bool_)
         self.cells_visited = np.array(state["cells_visited"], dtype=np.bool_)

@@ -26,7 +26,7 @@ class RunningNormalizer(nn.Module):
     def __init__(self, forgetting: float = 0.0, warmup: int = 0) -> None:
         super().__init__()
         self._forgetting = forgetting
-        self._warmup = warmup
+        self._warmup = max(warmup, 1)  # before the first update there is nothing to normalise by
         # Double precision: after 1e6 batches a float32 weight could no longer grow by one batch.
         for name in ("mean", "var", "weight", "updates"):
             self.register_buffer(name, torch.zeros((), dtype=torch.float64))

@@ -111,8 +111,13 @@ class RandomNetworkDistillation:
     @torch.no_grad()
     def bonus(self, obs: Tensor) -> Tensor:
         """Exploration reward (...) of observations (..., obs_dim), weighted by the coefficient."""
-        errors = self._normalizer(self._error(self._objects.select(obs)))
+        errors = self._normalizer(self.error(obs))
         return self.config.coefficient * errors.clamp(-self.config.clip, self.config.clip)
+
+    @torch.no_grad()
+    def error(self, obs: Tensor) -> Tensor:
+        """Raw prediction error (...), the sum over the networks' outputs."""
+        return self._error(self._objects.select(obs))
 
     def _error(self, picked: Tensor) -> Tensor:
         encoded = positional_encoding(picked, self.config.frequencies)

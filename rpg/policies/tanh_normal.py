@@ -30,9 +30,12 @@ class TanhNormal:
         """tanh of the mean, (..., action_dim)."""
         return self.mean.tanh()
 
-    def rsample(self) -> tuple[Tensor, Tensor]:
-        """Draw reparameterized actions (..., action_dim) and their log-density (...)."""
-        noise = torch.randn_like(self.mean)
+    def rsample(self, noise: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Draw reparameterized actions (..., action_dim) and their log-density (...).
+
+        ``noise`` (..., action_dim) replaces the standard normal draw.
+        """
+        noise = torch.randn_like(self.mean) if noise is None else noise
         u = self.mean + self.log_std.exp() * noise
         log_normal = -0.5 * noise.square() - self.log_std - 0.5 * math.log(2 * math.pi)
         return u.tanh(), (log_normal - _log_tanh_slope(u)).sum(-1)

@@ -92,12 +92,26 @@ class SegmentReplay:
             self._data[self._head - 1, :, self._ends] = 1.0
         self._episode_step.zero_()
 
-    def sample(self, batch_size: int, horizon: int) -> SegmentBatch:
-        """Draw ``batch_size`` segments of ``horizon`` steps, uniform over stored transitions."""
+    def sample(
+        self, batch_size: int, horizon: int, recent_fraction: float = 0.0, recent_window: int = 5000
+    ) -> SegmentBatch:
+        """Draw ``batch_size`` segments of ``horizon`` steps, uniform over stored transitions.
+
+        Args:
+            batch_size: N.
+            horizon: K.
+            recent_fraction: share of the batch drawn from the newest ``recent_window`` transitions alone,
+                so that a discovery is learned from while it is still news.
+            recent_window: in transitions.
+        """
         if not self._filled:
             raise RPGError("replay is empty: add transitions before sampling")
         device = self._data.device
         age = torch.randint(self._filled, (batch_size,), device=device)  # 0 is the oldest row
+        recent = round(batch_size * recent_fraction)
+        if recent:
+            window = min(self._filled, max(recent_window // self._num_envs, 1))
+            age[:recent] = torch.randint(self._filled - window, self._filled, (recent,), device=device)
         env = torch.randint(self._num_envs, (batch_size,), device=device)
         steps = torch.arange(horizon, device=device).unsqueeze(1)
         ages = age + steps  # (K, N)

@@ -8,6 +8,8 @@ from torch import Tensor, nn
 from rpg.exploration.objects import ObjectsOfInterest
 from rpg.exploration.positional import encoded_dim, positional_encoding
 
+_LARGEST = 1e3  # sensible inputs are of order one
+
 
 class ObservationInput(nn.Module):
     """Raw observation, scaled down, beside its objects of interest.
@@ -26,5 +28,7 @@ class ObservationInput(nn.Module):
 
     def forward(self, obs: Tensor) -> Tensor:
         """(..., obs_dim) -> (..., dim)."""
-        encoded = positional_encoding(self._objects.select(obs), self._frequencies)
-        return torch.cat([obs * self._obs_scale, encoded], dim=-1)
+        # An absurd reading must not push the networks to where float32 overflows when squared.
+        objects = self._objects.select(obs).clamp(-_LARGEST, _LARGEST)
+        raw = (obs * self._obs_scale).clamp(-_LARGEST, _LARGEST)
+        return torch.cat([raw, positional_encoding(objects, self._frequencies)], dim=-1)

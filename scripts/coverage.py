@@ -1,0 +1,144 @@
+"""Run or resume the maze experiments and gather their curves.
+
+    python scripts/coverage.py list                       # what there is
+    python scripts/coverage.py run rpg mbsac --jobs 2     # run these variants, resuming what was interrupted
+    python scripts/coverage.py gather                     # runs/coverage -> results/maze/coverage.csv
+
+Every run is an ordinary `rpg-train` command, one thread each; `gather` reads its progress.csv and run.json.
+Coverage is the share of the maze's 100 unit cells ever visited during training.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+_RUNS = Path("runs/coverage")
+_OUT = Path("results/maze/coverage.csv")
+_COLUMNS = "agent,latent,preset,variant,seed,num_envs,env_steps,updates,wall_s,coverage,commit".split(",")
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One line of the experiment: what differs from `rpg-train agent=... size=...`."""
+
+    agent: str
+    latent: str
+    overrides: tuple[str, ...] = ()
+    preset: str = "fast"
+    steps: int = 100_000
+    seeds: tuple[int, ...] = (0, 1, 2)
+    column: str = ""  # name in the csv's agent column where it is not the agent itself
+
+
+VARIANTS = {
+    "rpg": Variant("rpg", "gaussian12"),
+    "mbsac": Variant("mbsac", "none"),
+    "rpg-categorical": Variant(
+        "rpg", "categorical12", ("agent.latent.gaussian=0", "agent.latent.categories=12"), seeds=(0,)
+    ),
+    "random": Variant("random", "none", steps=240_000),
+    "sticky": Variant("sticky", "none", steps=240_000),
+    "bump": Variant("bump", "none", steps=240_000),
+    "untrained": Variant(
+        "rpg", "gaussian12", ("trainer.decisions_per_update=0",), steps=240_000, column="untrained_rpg"
+    ),
+}
+
+
+def command(name: str, variant: Variant, seed: int) -> list[str]:
+    """The `rpg-train` command of one run."""
+    return [
+        sys.executable, "-m", "rpg.train", f"agent={variant.agent}", "env=maze", f"size={variant.preset}",
+        f"seed={seed}", "threads=1", "logger=files", f"trainer.steps={variant.steps}", "trainer.eval_every=0",
+        *variant.overrides, f"run_dir={_RUNS / name / f'seed{seed}'}",
+    ]  # fmt: skip
+
+
+def run(names: list[str], jobs: int, seeds: list[int] | None) -> int:
+    """Run the variants, seed by seed, ``jobs`` at a time; returns the number of failures."""
+    todo = [
+        (seed, name)
+        for seed in range(max(max(VARIANTS[n].seeds) for n in names) + 1)
+        for name in names
+        if seed in (seeds or VARIANTS[name].seeds)
+    ]
+
+    def one(job: tuple[int, str]) -> int:
+        seed, name = job
+        folder = _RUNS / name / f"seed{seed}"
+        folder.mkdir(parents=True, exist_ok=True)
+        with (folder / "output.txt").open("a") as output:
+            done = subprocess.run(command(name, VARIANTS[name], seed), stdout=output, stderr=output, check=False)
+        print(f"{name} seed {seed}: {'done' if done.returncode == 0 else f'failed, see {output.name}'}", flush=True)
+        return done.returncode != 0
+
+    with ThreadPoolExecutor(jobs) as pool:
+        return sum(pool.map(one, todo))
+
+
+def gather() -> int:
+    """Write one row per run and log row; keeps rows of runs whose folders are gone."""
+    fresh: list[dict[str, str]] = []
+    for name, variant in VARIANTS.items():
+        for folder in sorted((_RUNS / name).glob("seed*")):
+            if not (folder / "progress.csv").exists():
+                continue
+            commit = json.loads((folder / "run.json").read_text())["commit"]
+            num_envs = next(
+                line.split(":")[1].strip()
+                for line in (folder / "config.yaml").read_text().splitlines()
+                if line.strip().startswith("num_envs:")
+            )
+            with (folder / "progress.csv").open() as file:
+                fresh += [
+                    {
+                        "agent": variant.column or variant.agent, "latent": variant.latent,
+                        "preset": variant.preset, "variant": name, "seed": folder.name.removeprefix("seed"),
+                        "num_envs": num_envs, "env_steps": row["env_steps"], "updates": row["updates"],
+                        "wall_s": row["wall_s"], "coverage": row["train/coverage"], "commit": commit,
+                    }
+                    for row in csv.DictReader(file)
+                    if row.get("train/coverage")
+                ]  # fmt: skip
+    made = {(row["variant"], row["seed"]) for row in fresh}
+    kept: list[dict[str, str]] = []
+    if _OUT.exists():
+        with _OUT.open() as file:
+            kept = [row for row in csv.DictReader(file) if (row["variant"], row["seed"]) not in made]
+    _OUT.parent.mkdir(parents=True, exist_ok=True)
+    rows = sorted(kept + fresh, key=lambda r: (r["variant"], int(r["seed"]), int(r["env_steps"])))
+    with _OUT.open("w", newline="") as file:
+        writer = csv.DictWriter(file, _COLUMNS, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+    print(f"{_OUT}: {len(rows)} rows, {len({(r['variant'], r['seed']) for r in rows})} runs")
+    return 0
+
+
+def main() -> int:
+    """Console entry."""
+    parser = argparse.ArgumentParser(description="Maze experiments.")
+    parser.add_argument("action", choices=["list", "run", "gather"])
+    parser.add_argument("variants", nargs="*", choices=[*VARIANTS, []], help="default: all")
+    parser.add_argument("--jobs", type=int, default=2, help="runs side by side")
+    parser.add_argument("--seeds", type=int, nargs="*")
+    args = parser.parse_args()
+    names = args.variants or list(VARIANTS)
+    if args.action == "list":
+        for name in names:
+            print(f"{name:18} {' '.join(command(name, VARIANTS[name], 0)[3:])}")
+        return 0
+    if args.action == "run":
+        return run(names, args.jobs, args.seeds)
+    return gather()
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

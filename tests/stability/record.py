@@ -1,0 +1,35 @@
+"""Long stability runs leave what they measured in results/stability/<test>.json."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+from rpg.provenance import commit
+
+_FOLDER = Path(__file__).parents[2] / "results" / "stability"
+STARTED = time.perf_counter()
+
+
+def record(
+    test: str, seed: int, config: dict[str, Any], metric: str, value: float, passed: bool, wall_s: float
+) -> None:
+    """Append one measurement; a failed one is kept too."""
+    path = _FOLDER / f"{test}.json"
+    rows = json.loads(path.read_text()) if path.exists() else []
+    rows.append(
+        {
+            "test": test,
+            "seed": seed,
+            "config": config,
+            "metric": metric,
+            "value": value,
+            "passed": bool(passed),
+            "wall_s": round(wall_s, 1),
+            "commit": commit(),
+        }
+    )
+    _FOLDER.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(rows, indent=1) + "\n")

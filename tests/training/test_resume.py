@@ -1,0 +1,233 @@
+from __future__ import annotations
+
+import signal
+import subprocess
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hydra import compose, initialize_config_module
+from omegaconf import DictConfig
+from torch import Tensor
+
+from rpg.errors import CheckpointError
+from rpg.train import train
+from rpg.training.build import build_trainer, parse_config
+from rpg.training.checkpoint import load_checkpoint
+from rpg.training.loggers import read_rows
+from rpg.training.trainer import Trainer
+
+Composed = Callable[..., DictConfig]
+Command = Callable[..., subprocess.Popen[str]]
+
+SHORT = (
+    "experiment=debug",
+    "trainer.steps=300",
+    "trainer.seed_decisions=40",
+    "trainer.log_every=50",
+    "trainer.checkpoint_every=100",
+    "trainer.eval_every=150",
+    "trainer.decisions_per_update=10",
+    "trainer.picture_every=0",
+)
+REAL = (*SHORT, "trainer.steps=900", "trainer.eval_every=450")
+LEARNED_PRIOR = ("agent.latent.gaussian=0", "agent.latent.categories=3", "agent.prior.mode=policy_gradient")
+
+
+def interrupt(cfg: DictConfig, at: int) -> Trainer:
+    """Train until ``at`` env steps, then stop as Ctrl-C would."""
+    trainer = build_trainer(parse_config(cfg))
+    trainer.train(should_stop=lambda: trainer.env_steps >= at)
+    return trainer
+
+
+def rows(run: Path) -> list[dict[str, Any]]:
+    """The metrics of a run without clock readings."""
+    clock = ("wall_s", "time/")
+    return [{k: v for k, v in row.items() if not k.startswith(clock)} for row in read_rows(run / "metrics.jsonl")]
+
+
+def flat(tree: Any, prefix: str = "") -> dict[str, Any]:
+    if not isinstance(tree, dict | list | tuple):
+        return {prefix: tree}
+    items = tree.items() if isinstance(tree, dict) else enumerate(tree)
+    return {k: v for key, sub in items for k, v in flat(sub, f"{prefix}/{key}").items()}
+
+
+def same(a: Any, b: Any) -> bool:
+    if isinstance(a, Tensor) and isinstance(b, Tensor):
+        return a.dtype == b.dtype and torch.equal(a, b)
+    return bool(a == b)
+
+
+def checkpoint_differences(a: Path, b: Path) -> list[str]:
+    """Names of checkpoint entries that are not bit-equal, clock readings and run folders aside."""
+    first, second = flat(load_checkpoint(a / "checkpoint.pt")), flat(load_checkpoint(b / "checkpoint.pt"))
+    differ = [k for k in first.keys() | second.keys() if not same(first.get(k), second.get(k))]
+    ignored = ("/wall_s", "/last_row/wall_s", "/last_row/time/", "/config/run_dir")
+    return sorted(k for k in differ if not k.startswith(ignored))
+
+
+def complete(folder: Path, overrides: tuple[str, ...]) -> Path:
+    with initialize_config_module("rpg.conf", version_base="1.3"):
+        train(compose("config", [f"run_dir={folder / 'run'}", "device=cpu", "logger=files", *overrides]))
+    return folder / "run"
+
+
+@pytest.fixture(scope="module")
+def straight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of SHORT that nothing interrupted."""
+    return complete(tmp_path_factory.mktemp("straight"), SHORT)
+
+
+@pytest.fixture(scope="module")
+def straight_real(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of REAL that nothing interrupted."""
+    return complete(tmp_path_factory.mktemp("straight"), REAL)
+
+
+def assert_equal_runs(a: Path, b: Path) -> None:
+    assert rows(a) == rows(b)
+    assert checkpoint_differences(a, b) == []
+
+
+# -- in this process -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("at", [0, 135])
+def test_a_resumed_run_equals_an_uninterrupted_one(
+    composed: Composed, straight: Path, tmp_path: Path, at: int
+) -> None:
+    cfg = composed(*SHORT)
+    assert interrupt(cfg, at).env_steps == at
+    assert train(cfg)["env_steps"] == 300
+    assert_equal_runs(tmp_path / "run", straight)
+
+
+def test_a_resumed_run_with_a_learned_prior_equals_an_uninterrupted_one(composed: Composed, tmp_path: Path) -> None:
+    straight = complete(tmp_path, (*SHORT, *LEARNED_PRIOR))
+    cfg = composed(*SHORT, *LEARNED_PRIOR, f"run_dir={tmp_path / 'resumed'}")
+    interrupt(cfg, 135)
+    train(cfg)
+    assert_equal_runs(tmp_path / "resumed", straight)
+
+
+def test_a_finished_run_can_be_extended(composed: Composed, straight: Path, tmp_path: Path) -> None:
+    train(composed(*SHORT, "trainer.steps=150"))
+    train(composed(*SHORT))
+    assert_equal_runs(tmp_path / "run", straight)
+
+
+def test_training_a_finished_run_again_changes_nothing(composed: Composed, tmp_path: Path) -> None:
+    cfg = composed(*SHORT, "trainer.steps=100")
+    train(cfg)
+    before, content = rows(tmp_path / "run"), flat(load_checkpoint(tmp_path / "run" / "checkpoint.pt"))
+    last = train(cfg)
+    assert last["env_steps"] == 100
+    assert rows(tmp_path / "run") == before
+    after = flat(load_checkpoint(tmp_path / "run" / "checkpoint.pt"))
+    assert [k for k in content if k != "/wall_s" and not same(content[k], after[k])] == []
+
+
+class PowerFailure(Exception):
+    pass
+
+
+@pytest.mark.parametrize(("at", "saved"), [(180, True), (80, False)], ids=["later", "before the first checkpoint"])
+def test_what_a_crashed_process_logged_is_not_logged_twice(
+    composed: Composed, straight: Path, tmp_path: Path, at: int, saved: bool
+) -> None:
+    cfg = composed(*SHORT)  # rows every 50 env steps, checkpoints every 100
+    trainer = build_trainer(parse_config(cfg))
+
+    def fail() -> bool:
+        if trainer.env_steps >= at:
+            raise PowerFailure
+        return False
+
+    with pytest.raises(PowerFailure):
+        trainer.train(should_stop=fail)
+    assert trainer.checkpoint_path.exists() == saved
+    train(cfg)
+    assert_equal_runs(tmp_path / "run", straight)
+
+
+def test_a_simulator_without_state_goes_on_with_new_episodes_and_says_so(
+    composed: Composed, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cfg = composed(*SHORT, "env=gym", "env.id=Pendulum-v1", "env.num_envs=2", "trainer.eval_every=0")
+    stopped = interrupt(cfg, at=234)  # 117 steps into the first episodes
+    capsys.readouterr()
+    last = train(cfg)
+    said = capsys.readouterr().out
+    assert "resumed" in said
+    assert "new episodes" in said
+    assert last["env_steps"] == 300
+    steps = [row["env_steps"] for row in rows(tmp_path / "run")]
+    assert steps == sorted(set(steps)) == [50, 100, 150, 200, 250, 300]
+    # No segment joins the lost episodes to the new ones, of which 33 steps are played.
+    replay = stopped._replay
+    replay.load_state_dict(load_checkpoint(tmp_path / "run" / "checkpoint.pt")["replay"])
+    torch.manual_seed(0)
+    batch = replay.sample(2000, 2)
+    assert batch.step.max() == 116
+    assert batch.mask[1][batch.step == 116].sum() == 0
+    assert batch.mask[1][batch.step == 115].all()
+
+
+def test_another_runs_folder_is_refused_and_kept(composed: Composed, tmp_path: Path) -> None:
+    train(composed(*SHORT, "trainer.steps=50"))
+    before = (tmp_path / "run" / "checkpoint.pt").read_bytes()
+    with pytest.raises(CheckpointError, match="agent.gamma=0.99, asked for 0.9"):
+        train(composed(*SHORT, "trainer.steps=50", "agent.gamma=0.9"))
+    assert (tmp_path / "run" / "checkpoint.pt").read_bytes() == before
+
+
+# -- the real command ----------------------------------------------------------------------------------
+
+def wait_for_rows(process: subprocess.Popen[str], run: Path, count: int) -> None:
+    log = run / "metrics.jsonl"
+    deadline = time.monotonic() + 120
+    while process.poll() is None and time.monotonic() < deadline:
+        if log.exists() and log.read_bytes().count(b"\n") >= count:
+            return
+        time.sleep(0.005)
+    pytest.fail(f"ended (or hung) before row {count}: {process.communicate()}")
+
+
+def test_survives_kill_at_any_moment(command: Command, straight_real: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    rng = np.random.default_rng()
+    for count in (1, int(rng.integers(4, 9)), int(rng.integers(10, 15))):
+        process = command("rpg.train", f"run_dir={run}", "device=cpu", "logger=files", *REAL)
+        wait_for_rows(process, run, count)
+        time.sleep(rng.uniform(0, 0.1))
+        process.kill()
+        process.communicate()
+        assert process.returncode == -signal.SIGKILL
+    process = command("rpg.train", f"run_dir={run}", "device=cpu", "logger=files", *REAL)
+    _, err = process.communicate(timeout=120)
+    assert process.returncode == 0, err
+    assert_equal_runs(run, straight_real)
+
+
+@pytest.mark.parametrize(("number", "name"), [(signal.SIGINT, "Ctrl-C"), (signal.SIGTERM, "SIGTERM")])
+def test_a_polite_signal_saves_and_tells_how_to_resume(
+    command: Command, composed: Composed, straight_real: Path, tmp_path: Path, number: int, name: str
+) -> None:
+    run = tmp_path / "run"
+    process = command("rpg.train", f"run_dir={run}", "device=cpu", "logger=files", *REAL)
+    wait_for_rows(process, run, 3)
+    process.send_signal(number)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert f"stopped by {name}" in out
+    assert "resume with" in out
+    assert f"run_dir={run}" in out
+    assert "Traceback" not in err
+    train(composed(*REAL))
+    assert_equal_runs(run, straight_real)
