@@ -197,7 +197,7 @@ def draw(curves: Sequence[Curve], metric: str, out: Path) -> None:
         band = (curve.point, curve.low, curve.high)
         figures.curve(left, curve.env_steps, *band, label=label, index=index)
         figures.curve(right, curve.wall_s, *band, label=label, index=index)
-    figures.style_axes(left, ylabel=metric)
+    figures.style_axes(left, ylabel=f"{metric} (IQM, 95 % interval)")
     figures.steps_axis(left)
     figures.time_axis(right, max(float(curve.wall_s[-1]) for curve in curves))
     figures.legend(fig, left)
@@ -244,7 +244,7 @@ def main(argv: list[str] | None = None) -> int:
         write_csv(curves, args.metric, args.out.with_suffix(".csv"))
         draw(curves, args.metric, args.out)
     except RPGError as error:
-        print(f"rpg-plot: {error}", file=sys.stderr)
+        print(f"error: {error}", file=sys.stderr)
         return 2
     for curve, members in zip(curves, groups.values(), strict=True):
         _tell_short_runs(curve, members, args.metric)
@@ -253,6 +253,11 @@ def main(argv: list[str] | None = None) -> int:
         f" {', '.join(str(len(members)) for members in groups.values())}"
     )
     return 0
+
+
+def entry() -> None:
+    """The console command ``rpg-plot``."""
+    sys.exit(main())
 
 
 def _tell_short_runs(curve: Curve, runs: Sequence[Run], metric: str) -> None:
@@ -305,4 +310,4 @@ def _dotted(config: dict[str, Any], prefix: str = "") -> list[str]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    entry()

@@ -21,7 +21,9 @@ from pathlib import Path
 
 _RUNS = Path("runs/coverage")
 _OUT = Path("results/maze/coverage.csv")
-_COLUMNS = "agent,latent,preset,variant,seed,num_envs,env_steps,updates,wall_s,coverage,commit".split(",")
+_COLUMNS = [
+    "agent", "latent", "preset", "variant", "seed", "num_envs", "env_steps", "updates", "wall_s", "coverage", "commit",
+]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -75,8 +77,13 @@ def run(names: list[str], jobs: int, seeds: list[int] | None) -> int:
         folder = _RUNS / name / f"seed{seed}"
         folder.mkdir(parents=True, exist_ok=True)
         with (folder / "output.txt").open("a") as output:
-            done = subprocess.run(command(name, VARIANTS[name], seed), stdout=output, stderr=output, check=False)
-        print(f"{name} seed {seed}: {'done' if done.returncode == 0 else f'failed, see {output.name}'}", flush=True)
+            done = subprocess.run(
+                command(name, VARIANTS[name], seed), stdout=output, stderr=output, check=False
+            )
+        print(
+            f"{name} seed {seed}: {'done' if done.returncode == 0 else f'failed, see {output.name}'}",
+            flush=True,
+        )
         return done.returncode != 0
 
     with ThreadPoolExecutor(jobs) as pool:

@@ -23,7 +23,9 @@ def composed(tmp_path: Path) -> Callable[..., DictConfig]:
 
     def make(*overrides: str) -> DictConfig:
         with initialize_config_module("rpg.conf", version_base="1.3"):
-            return compose("config", [f"run_dir={tmp_path / 'run'}", "device=cpu", "logger=files", *overrides])
+            return compose(
+                "config", [f"run_dir={tmp_path / 'run'}", "device=cpu", "logger=files", *overrides]
+            )
 
     return make
 

@@ -148,7 +148,9 @@ class RPG(Agent):
                 metrics |= self.prior.update(self._value_of_starts, env_steps)
         if self._updates % self.config.world_model.target_every == 0:
             with torch.no_grad():
-                torch._foreach_lerp_(self._target_params, self._model_params, self.config.world_model.target_rate)
+                torch._foreach_lerp_(
+                    self._target_params, self._model_params, self.config.world_model.target_rate
+                )
         self._updates += 1
         return metrics
 

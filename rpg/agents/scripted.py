@@ -130,7 +130,7 @@ class BumpPolicy(ScriptedPolicy):
         return self.to_env(self._action)
 
     def episode_state(self) -> dict[str, Tensor]:
-        """Held actions (n, action_dim) in [-1, 1], last positions (n, position), which episodes are fresh (n,)."""
+        """Held actions (n, action_dim) in [-1, 1], last positions (n, position), fresh episodes (n,) bool."""
         return {"action": self._action.clone(), "last": self._last.clone(), "fresh": self._fresh.clone()}
 
     def restore_episode_state(self, state: dict[str, Tensor]) -> None:

@@ -21,6 +21,7 @@ class EnvConfig:
         action_repeat: simulator steps per decision that the environment makes inside one ``step``.
         reward_scale: 1/T in Eq. 3.2; 1 in mazes, 5 in the published tasks.
         obs_scale: multiplier of raw observations in the networks' input.
+        tuning: agent settings that suit this environment, for the agent's own config to refer to.
     """
 
     name: str = "maze"
@@ -31,6 +32,7 @@ class EnvConfig:
     action_repeat: int = 1
     reward_scale: float = 1.0
     obs_scale: float = 1.0
+    tuning: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.num_envs < 1 or self.action_repeat < 1:

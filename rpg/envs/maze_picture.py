@@ -35,16 +35,16 @@ class MazeCanvas:
         self.pixel = 2 * extent / PIXELS
         centres = (np.arange(PIXELS) + 0.5) * self.pixel - extent
         self.x, self.y = centres[None, :], -centres[:, None]  # (1, P) and (P, 1)
-        distance = np.full((PIXELS, PIXELS), np.inf)  # to the nearest wall
+        squared = np.full((PIXELS, PIXELS), np.inf)  # distance to the nearest wall
         for x0, y0, x1, y1 in layout.walls:
             dx = np.maximum(np.maximum(min(x0, x1) - self.x, self.x - max(x0, x1)), 0.0)
             dy = np.maximum(np.maximum(min(y0, y1) - self.y, self.y - max(y0, y1)), 0.0)
-            np.minimum(distance, np.hypot(dx, dy), out=distance)
+            np.minimum(squared, dx * dx + dy * dy, out=squared)
         self.background = np.empty((PIXELS, PIXELS, 3))
         self.background[:] = PAPER
         if goal is not None:
             self._blend(self.background, GOAL, goal_radius - self._distance(goal))
-        self._blend(self.background, WALL, self.pixel - distance)
+        self._blend(self.background, WALL, self.pixel - np.sqrt(squared))
 
     def frame(self, point: Floats) -> Frame:
         """The maze with a point (2,) in it: uint8 (256, 256, 3) RGB."""

@@ -87,7 +87,8 @@ class MazeTracker:
             if np.shape(state[name]) != getattr(self, name).shape:
                 raise CheckpointError(
                     f"maze tracker: '{name}' of shape {np.shape(state[name])} does not fit maze "
-                    f"'{self.layout.name}' {getattr(self, name).shape}; choose the layout that the run was started with"
+                    f"'{self.layout.name}' {getattr(self, name).shape}; "
+                    "choose the layout that the run was started with"
                 )
         self.units_visited = np.array(state["units_visited"], dtype=np.bool_)
         self.cells_visited = np.array(state["cells_visited"], dtype=np.bool_)

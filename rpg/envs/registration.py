@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import gymnasium
 
+from rpg.envs.bandit import register_bandit
+
 MAZES = {
     "rpg/GapMaze-v1": "gap_v1",
     "rpg/SmallMaze-v0": "small",
@@ -17,6 +19,7 @@ MAZES = {
 
 def register_all() -> None:
     """Register every environment with gymnasium; safe to call again. Nothing heavy is imported."""
+    register_bandit()
     for env_id, layout in MAZES.items():
         if env_id not in gymnasium.registry:
             gymnasium.register(

@@ -165,7 +165,6 @@ class TensorBoardSink:
     """Event files in ``<run_dir>/tensorboard``; on a rewind the viewer is told to purge what came after."""
 
     def __init__(self, run_dir: Path) -> None:
-        require_extra("tensorboard", "tensorboard", "logging to TensorBoard")
         self._dir = run_dir / "tensorboard"
         self._purge_step: int | None = None
         self._writer: Any = None

@@ -21,7 +21,8 @@ LATENTS, STATES, ACTIONS = 3, 4, 4
 TEMPERATURE = 0.5
 NEXT = torch.tensor([1, 2, 3, 3])
 REWARD = torch.tensor(
-    [[0.3, 1.0, -0.5, 0.9], [0.1, 0.8, 0.2, -1.0], [0.0, 0.4, 1.2, 1.1], [0.6, -0.2, 0.5, 0.0]], dtype=torch.float64
+    [[0.3, 1.0, -0.5, 0.9], [0.1, 0.8, 0.2, -1.0], [0.0, 0.4, 1.2, 1.1], [0.6, -0.2, 0.5, 0.0]],
+    dtype=torch.float64,
 )
 # Weight of each first action when all that can follow it is summed up, and of all trajectories.
 FIRST = REWARD[0] / TEMPERATURE + (REWARD / TEMPERATURE).logsumexp(1)[NEXT]
@@ -73,7 +74,9 @@ def bound(tables: Tables, posterior: Any = TablePosterior) -> float:
         bootstrap=torch.zeros(2, 2, len(Z)),
     )
     one = torch.tensor(1.0)
-    per_step = shaped_reward(imagined, torch.eye(LATENTS).double()[Z], posterior(tables.log_posterior), one, one)
+    per_step = shaped_reward(
+        imagined, torch.eye(LATENTS).double()[Z], posterior(tables.log_posterior), one, one
+    )
     weight = joint(tables)
     possible = weight > 0  # 0 log 0 = 0
     return float((weight * (per_step.sum(0) - tables.prior[Z].log()))[possible].sum())

@@ -80,7 +80,9 @@ def differences(a: Any, b: Any) -> list[str]:
     """Names of entries in which two state dicts are not bit-equal."""
     a, b = flat(a), flat(b)
     either = sorted(a.keys() ^ b.keys())
-    same = {k: torch.equal(a[k], b[k]) if isinstance(a[k], Tensor) else a[k] == b[k] for k in a.keys() & b.keys()}
+    same = {
+        k: torch.equal(a[k], b[k]) if isinstance(a[k], Tensor) else a[k] == b[k] for k in a.keys() & b.keys()
+    }
     return either + [k for k, equal in same.items() if not equal]
 
 
@@ -159,7 +161,9 @@ def test_bfloat16_runs_and_stays_finite(critic: str) -> None:
 
 
 def test_target_follows_by_its_rate_and_gets_no_gradient() -> None:
-    agent = make(replace(TINY, world_model=WorldModelConfig(state_dim=8, width=16, target_rate=0.25, target_every=1)))
+    agent = make(
+        replace(TINY, world_model=WorldModelConfig(state_dim=8, width=16, target_rate=0.25, target_every=1))
+    )
     before = [p.clone() for p in agent.target.parameters()]
     train(agent, batches(agent, 1))
     for old, new, online in zip(before, agent.target.parameters(), agent.model.parameters(), strict=True):
@@ -230,7 +234,9 @@ def test_alpha_stays_where_it_is_unless_tuned_and_below_its_bound() -> None:
 
 
 def test_reward_is_scaled_and_ramped_and_the_bonus_is_not() -> None:
-    agent = make(replace(TINY, reward_scale=3.0, reward_ramp=RewardRamp(level=0.5, first=100.0, second=200.0)))
+    agent = make(
+        replace(TINY, reward_scale=3.0, reward_ramp=RewardRamp(level=0.5, first=100.0, second=200.0))
+    )
     batch = next(batches(agent, 1))
     batch = batch._replace(reward=torch.full((3, 8), 2.0), bonus=torch.full((3, 8), 0.125))
     assert float(agent.update(batch, env_steps=50)["train/reward"]) == pytest.approx(2 * 3 * 0.25 + 0.125)
@@ -259,7 +265,9 @@ def test_z_is_drawn_where_an_episode_begins_and_kept_elsewhere() -> None:
     assert (new[mask] != old[mask]).all()
 
 
-def preferring(space: Any, wanted: int, prior: LatentPrior) -> Callable[[Tensor], tuple[Tensor, Tensor, Tensor]]:
+def preferring(
+    space: Any, wanted: int, prior: LatentPrior
+) -> Callable[[Tensor], tuple[Tensor, Tensor, Tensor]]:
     """States are the observations; category ``wanted`` is worth 5, or category 0 where obs[0] < 0."""
 
     def evaluate(obs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -279,7 +287,9 @@ def test_learned_prior_shifts_to_what_pays_from_each_start(mode: str) -> None:
     starts = torch.tensor([[-1.0, 0.0, 1.0], [1.0, 0.0, 1.0]])
     prior.remember(starts)
     frequency = prior.sample(2000, starts[:1].expand(2000, 3)).mean(0)
-    torch.testing.assert_close(frequency, torch.full((3,), 1 / 3), atol=0.05, rtol=0)  # begins as the fixed one
+    torch.testing.assert_close(
+        frequency, torch.full((3,), 1 / 3), atol=0.05, rtol=0
+    )  # begins as the fixed one
     for _ in range(200):
         prior.update(preferring(space, 2, prior), env_steps=0)
     for start, best in ((starts[0], 0), (starts[1], 2)):
@@ -291,7 +301,9 @@ def test_entropy_weight_keeps_the_learned_prior_broad() -> None:
         torch.manual_seed(0)
         space = make_latent_space(CATEGORIES)
         settings = PriorConfig(mode="policy_gradient", entropy_weight=weight, lr=1e-2)
-        prior = LatentPrior(space, 3, 3, replace(TINY, latent=CATEGORIES, prior=settings), torch.device("cpu"))
+        prior = LatentPrior(
+            space, 3, 3, replace(TINY, latent=CATEGORIES, prior=settings), torch.device("cpu")
+        )
         prior.remember(torch.ones(1, 3))
         rows = [prior.update(preferring(space, 2, prior), env_steps=0) for _ in range(100)]
         return float(rows[-1]["train/prior_entropy"])
@@ -305,7 +317,9 @@ def test_learned_prior_waits_for_a_start_to_learn_from() -> None:
     assert prior.update(lambda obs: pytest.fail("nothing to evaluate"), env_steps=0) == {}
 
 
-@pytest.mark.parametrize(("env_steps", "weight"), [(0, 2.0), (100, 2.0), (200, 1.0), (300, 0.0), (10_000, 0.0)])
+@pytest.mark.parametrize(
+    ("env_steps", "weight"), [(0, 2.0), (100, 2.0), (200, 1.0), (300, 0.0), (10_000, 0.0)]
+)
 def test_entropy_weight_decays_between_its_marks(env_steps: int, weight: float) -> None:
     schedule = PriorConfig(entropy_weight=2.0, decay_start=100, decay_end=300)
     assert schedule.entropy_weight_at(env_steps) == pytest.approx(weight)
@@ -370,12 +384,17 @@ UNUSABLE = {
     "matrix actions": (OBS, Box(-1, 1, (2, 2), np.float32)),
     "dict observations": (gym.spaces.Dict({"a": OBS, "b": OBS}), ACTION),
     "discrete observations": (gym.spaces.Discrete(3), ACTION),
-    "image observations": (Box(np.arange(48, dtype=np.float32).reshape(4, 4, 3), np.full((4, 4, 3), 255, np.float32)), ACTION),
+    "image observations": (
+        Box(np.arange(48, dtype=np.float32).reshape(4, 4, 3), np.full((4, 4, 3), 255, np.float32)),
+        ACTION,
+    ),
 }
 
 
 @pytest.mark.parametrize(("obs_space", "action_space"), UNUSABLE.values(), ids=UNUSABLE.keys())
-def test_unusable_spaces_are_refused_in_one_line(obs_space: gym.Space[Any], action_space: gym.Space[Any]) -> None:
+def test_unusable_spaces_are_refused_in_one_line(
+    obs_space: gym.Space[Any], action_space: gym.Space[Any]
+) -> None:
     with pytest.raises(RPGError, match="^(observation|action) space ") as caught:
         RPG(obs_space, action_space, TINY)
     assert "\n" not in str(caught.value)

@@ -15,7 +15,9 @@ SMALL = RNDConfig(coefficient=1.0, width=32, frequencies=2, capacity=1000, batch
 RAW = replace(SMALL, warmup=10**6)  # the bonus is the bare prediction error
 
 
-def estimator(config: RNDConfig = SMALL, objects: ObjectsOfInterest | None = None) -> RandomNetworkDistillation:
+def estimator(
+    config: RNDConfig = SMALL, objects: ObjectsOfInterest | None = None
+) -> RandomNetworkDistillation:
     torch.manual_seed(0)
     return RandomNetworkDistillation(objects or ObjectsOfInterest.of((0, 1)), config)
 
@@ -38,7 +40,14 @@ def segment(next_obs: Tensor) -> SegmentBatch:
     k, n, _ = next_obs.shape
     flags = torch.zeros(k, n)
     return SegmentBatch(
-        torch.zeros(n, 2), next_obs, torch.zeros(k, n, 1), torch.ones(k, n), flags, flags, torch.zeros(n, 0), flags[0]
+        torch.zeros(n, 2),
+        next_obs,
+        torch.zeros(k, n, 1),
+        torch.ones(k, n),
+        flags,
+        flags,
+        torch.zeros(n, 0),
+        flags[0],
     )
 
 
@@ -188,7 +197,15 @@ def test_continues_bit_equal_from_its_state() -> None:
 
 
 @pytest.mark.parametrize(
-    "bad", [{"capacity": 10}, {"batch_size": 0}, {"width": 0}, {"forgetting": 1.0}, {"frequencies": -1}, {"lr": 0.0}]
+    "bad",
+    [
+        {"capacity": 10},
+        {"batch_size": 0},
+        {"width": 0},
+        {"forgetting": 1.0},
+        {"frequencies": -1},
+        {"lr": 0.0},
+    ],
 )
 def test_impossible_settings_are_refused_in_one_line(bad: dict[str, float]) -> None:
     with pytest.raises(RPGError, match="^exploration: ") as caught:

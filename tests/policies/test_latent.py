@@ -68,14 +68,20 @@ def test_mixed_space_is_the_product_of_its_parts() -> None:
     torch.testing.assert_close(space.entropy(params), normal.entropy() + category.entropy())
     own = random_params(7)
     gaussian, categorical = make_latent_space(GAUSSIAN), make_latent_space(CATEGORICAL)
-    parts = gaussian.log_posterior(own[..., :3], z[..., :3]) + categorical.log_posterior(own[..., 3:], z[..., 3:])
+    parts = gaussian.log_posterior(own[..., :3], z[..., :3]) + categorical.log_posterior(
+        own[..., 3:], z[..., 3:]
+    )
     torch.testing.assert_close(space.log_posterior(own, z), parts)
 
 
 def test_empty_space_is_certain() -> None:
     space = make_latent_space(EMPTY)
     nothing = torch.zeros(5, 0)
-    for values in (space.log_prob(nothing, nothing), space.entropy(nothing), space.log_posterior(nothing, nothing)):
+    for values in (
+        space.log_prob(nothing, nothing),
+        space.entropy(nothing),
+        space.log_posterior(nothing, nothing),
+    ):
         assert values.tolist() == [0.0] * 5
 
 

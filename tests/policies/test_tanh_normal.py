@@ -33,7 +33,9 @@ def test_log_probs_of_samples_match_torch(params: Tensor) -> None:
 
 def test_log_probs_of_given_actions_match_torch(params: Tensor) -> None:
     action = torch.rand(50, 3, dtype=torch.float64) * 1.98 - 0.99
-    torch.testing.assert_close(TanhNormal(params, BASE_STD).log_prob(action), reference(params).log_prob(action))
+    torch.testing.assert_close(
+        TanhNormal(params, BASE_STD).log_prob(action), reference(params).log_prob(action)
+    )
 
 
 def test_density_integrates_to_one() -> None:

@@ -68,7 +68,9 @@ def test_without_encoding_an_unvisited_pocket_looks_known() -> None:
     ("no_buffer", ["exploration.capacity=2000"]),
     ("no_encoding", ["exploration.frequencies=0"]),
 ])  # fmt: skip
-def test_maze_coverage_without_buffer_or_encoding(name: str, overrides: list[str], tmp_path_factory) -> None:  # type: ignore[no-untyped-def]
+def test_maze_coverage_without_buffer_or_encoding(
+    name: str, overrides: list[str], tmp_path_factory: pytest.TempPathFactory
+) -> None:
     """40k steps each; the ablations are judged against the run of the full method, which comes first."""
     from hydra import compose, initialize_config_module
 

@@ -1,4 +1,4 @@
-"""Too small a beta and the policy ignores z; too large and it sacrifices reward to be recognisable (Fig. 3.13 B).
+"""Too small a beta and the policy ignores z; too large and it gives up reward to be recognisable (Fig. 3.13 B).
 
 Measured as the mutual information between z and the trajectory. z is categorical here, so the plug-in
 estimate over a few outcome bins is exact enough.
@@ -106,7 +106,7 @@ def test_moderate_beta_keeps_several_modes_of_the_bandit() -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("beta", [0.0, 0.01, 0.5])
-def test_information_in_the_maze(beta: float, tmp_path_factory) -> None:  # type: ignore[no-untyped-def]
+def test_information_in_the_maze(beta: float, tmp_path_factory: pytest.TempPathFactory) -> None:
     """25k steps with a categorical z: information between z and the cell where an episode ends."""
     from hydra import compose, initialize_config_module
 

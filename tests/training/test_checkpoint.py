@@ -13,7 +13,12 @@ import torch
 from rpg.errors import CheckpointError, RPGError
 from rpg.training.checkpoint import load_checkpoint, save_checkpoint
 
-CONTENT = {"weights": {"w": torch.arange(6.0).view(2, 3)}, "steps": 12, "episodes": [(1.5, 3, True)], "none": None}
+CONTENT = {
+    "weights": {"w": torch.arange(6.0).view(2, 3)},
+    "steps": 12,
+    "episodes": [(1.5, 3, True)],
+    "none": None,
+}
 
 
 @pytest.fixture
@@ -34,7 +39,11 @@ def test_content_comes_back_equal(path: Path) -> None:
     save_checkpoint(path, CONTENT)
     loaded = load_checkpoint(path)
     assert torch.equal(loaded["weights"]["w"], CONTENT["weights"]["w"])
-    assert {k: loaded[k] for k in ("steps", "episodes", "none")} == {"steps": 12, "episodes": [(1.5, 3, True)], "none": None}
+    assert {k: loaded[k] for k in ("steps", "episodes", "none")} == {
+        "steps": 12,
+        "episodes": [(1.5, 3, True)],
+        "none": None,
+    }
 
 
 def test_saving_again_replaces_and_leaves_nothing_else_behind(path: Path) -> None:
@@ -92,7 +101,9 @@ class Malicious:
         return (os.mkdir, (str(self.target),))
 
 
-@pytest.mark.parametrize("write", [torch.save, lambda x, p: p.write_bytes(pickle.dumps(x))], ids=["torch", "pickle"])
+@pytest.mark.parametrize(
+    "write", [torch.save, lambda x, p: p.write_bytes(pickle.dumps(x))], ids=["torch", "pickle"]
+)
 def test_code_in_a_checkpoint_is_refused_and_not_run(path: Path, write: Any) -> None:
     victim = path.parent / "victim"
     write({"format": "rpg-checkpoint", "version": 1, "agent": Malicious(victim)}, path)
@@ -117,7 +128,14 @@ def test_a_truncated_file_is_refused(path: Path, keep: float) -> None:
 def test_noise_and_text_are_refused(path: Path) -> None:
     rng = np.random.default_rng(0)
     samples = [rng.bytes(200) for _ in range(200)]
-    samples += [b"hello\n", b"{}", b"\x80\x02}q\x00.", b"\x80\x04N.", pickle.dumps([1, 2, 3]), b"PK\x03\x04" + bytes(60)]
+    samples += [
+        b"hello\n",
+        b"{}",
+        b"\x80\x02}q\x00.",
+        b"\x80\x04N.",
+        pickle.dumps([1, 2, 3]),
+        b"PK\x03\x04" + bytes(60),
+    ]
     for data in samples:
         path.write_bytes(data)
         refusal(path)

@@ -72,7 +72,10 @@ def segments(batch: SegmentBatch) -> Iterator[dict[str, Any]]:
             "obs": batch.obs[i].numpy(),
             "latent": batch.latent[i].numpy(),
             "step": float(batch.step[i]),
-            **{k: getattr(batch, k)[:, i].numpy() for k in ("next_obs", "action", "reward", "terminated", "mask")},
+            **{
+                k: getattr(batch, k)[:, i].numpy()
+                for k in ("next_obs", "action", "reward", "terminated", "mask")
+            },
         }
 
 

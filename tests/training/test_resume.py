@@ -48,7 +48,9 @@ def interrupt(cfg: DictConfig, at: int) -> Trainer:
 def rows(run: Path) -> list[dict[str, Any]]:
     """The metrics of a run without clock readings."""
     clock = ("wall_s", "time/")
-    return [{k: v for k, v in row.items() if not k.startswith(clock)} for row in read_rows(run / "metrics.jsonl")]
+    return [
+        {k: v for k, v in row.items() if not k.startswith(clock)} for row in read_rows(run / "metrics.jsonl")
+    ]
 
 
 def flat(tree: Any, prefix: str = "") -> dict[str, Any]:
@@ -108,7 +110,9 @@ def test_a_resumed_run_equals_an_uninterrupted_one(
     assert_equal_runs(tmp_path / "run", straight)
 
 
-def test_a_resumed_run_with_a_learned_prior_equals_an_uninterrupted_one(composed: Composed, tmp_path: Path) -> None:
+def test_a_resumed_run_with_a_learned_prior_equals_an_uninterrupted_one(
+    composed: Composed, tmp_path: Path
+) -> None:
     straight = complete(tmp_path, (*SHORT, *LEARNED_PRIOR))
     cfg = composed(*SHORT, *LEARNED_PRIOR, f"run_dir={tmp_path / 'resumed'}")
     interrupt(cfg, 135)
@@ -137,7 +141,9 @@ class PowerFailure(Exception):
     pass
 
 
-@pytest.mark.parametrize(("at", "saved"), [(180, True), (80, False)], ids=["later", "before the first checkpoint"])
+@pytest.mark.parametrize(
+    ("at", "saved"), [(180, True), (80, False)], ids=["later", "before the first checkpoint"]
+)
 def test_what_a_crashed_process_logged_is_not_logged_twice(
     composed: Composed, straight: Path, tmp_path: Path, at: int, saved: bool
 ) -> None:
@@ -188,6 +194,7 @@ def test_another_runs_folder_is_refused_and_kept(composed: Composed, tmp_path: P
 
 
 # -- the real command ----------------------------------------------------------------------------------
+
 
 def wait_for_rows(process: subprocess.Popen[str], run: Path, count: int) -> None:
     log = run / "metrics.jsonl"

@@ -113,9 +113,12 @@ def test_finished_episodes_are_summed_up() -> None:
 
 
 @pytest.mark.parametrize(
-    ("success_at", "at_end", "ever"), [(2, False, True), (3, True, True), (7, False, False), (None, False, False)]
+    ("success_at", "at_end", "ever"),
+    [(2, False, True), (3, True, True), (7, False, False), (None, False, False)],
 )
-def test_success_is_judged_at_the_end_and_at_any_time(success_at: int | None, at_end: bool, ever: bool) -> None:
+def test_success_is_judged_at_the_end_and_at_any_time(
+    success_at: int | None, at_end: bool, ever: bool
+) -> None:
     runner = started(lambda: Clock(3, success_at=success_at), lambda: Clock(9))
     for _ in range(2):  # the second episode starts with a clean slate
         episode = [runner.step()[1] for _ in range(3)][-1][0]
@@ -179,7 +182,9 @@ def test_environments_that_cannot_be_restored_go_on_with_the_next_seeds() -> Non
     assert resumed.at_boundary
     assert resumed.observations[:, 1].tolist() == [0, 0]
     assert resumed.observations[:, 0].tolist() == [straight[0][2], straight[1][1]]
-    assert [e.length for _ in range(3) for e in resumed.step()[1]] == [3]  # nothing of the lost episode counts
+    assert [e.length for _ in range(3) for e in resumed.step()[1]] == [
+        3
+    ]  # nothing of the lost episode counts
 
 
 def test_environments_that_can_be_restored_go_on_in_mid_episode() -> None:

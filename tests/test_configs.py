@@ -1,0 +1,95 @@
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import pytest
+from omegaconf import DictConfig, OmegaConf
+
+import rpg.conf
+from rpg.agents import LatentConfig, RPGConfig
+from rpg.envs.registration import register_all
+from rpg.exploration import RNDConfig
+from rpg.train import train
+from rpg.training.build import parse_config
+from rpg.training.config import LoggerConfig, RunConfig, TrainerConfig
+
+Composed = Callable[..., DictConfig]
+
+CONF = Path(rpg.conf.__file__).parent
+AGENTS = sorted(p.stem for p in (CONF / "agent").glob("*.yaml"))
+OPTIONS = sorted((p.parent.name, p.stem) for p in CONF.glob("*/*.yaml") if p.parent.name != "agent")
+LEARNERS = {"rpg", "mbsac"}
+
+
+@pytest.mark.parametrize(("group", "option"), OPTIONS, ids=[f"{g}={o}" for g, o in OPTIONS])
+def test_every_option_goes_with_every_agent(composed: Composed, group: str, option: str) -> None:
+    for agent in AGENTS:
+        run = parse_config(composed(f"agent={agent}", f"{group}={option}"))
+        assert run.agent_name == agent
+
+
+def paper(composed: Composed, *overrides: str) -> RunConfig:
+    return parse_config(composed("agent=rpg", "size=paper", *overrides))
+
+
+def test_published_sizes_are_the_defaults_in_code(composed: Composed) -> None:
+    run = paper(composed)
+    assert run.agent == RPGConfig()
+    assert run.exploration == RNDConfig()
+    assert run.trainer == TrainerConfig()
+
+
+def test_default_logger_is_the_one_in_code(composed: Composed) -> None:
+    assert parse_config(composed("logger=tensorboard")).logger == LoggerConfig()
+
+
+def test_mbsac_is_rpg_without_a_latent(composed: Composed) -> None:
+    run = parse_config(composed("agent=mbsac", "size=paper"))
+    assert run.agent.latent == LatentConfig(gaussian=0, categories=0)
+    assert dataclasses.replace(run.agent, latent=LatentConfig()) == RPGConfig()
+
+
+def leaves(tree: Any, prefix: str = "") -> set[str]:
+    if not isinstance(tree, dict) or not tree:
+        return {prefix}
+    return {leaf for key, sub in tree.items() for leaf in leaves(sub, f"{prefix}.{key}")}
+
+
+def test_every_setting_can_be_given_on_the_command_line(composed: Composed) -> None:
+    cfg = OmegaConf.to_container(composed("agent=rpg"), resolve=True)
+    assert isinstance(cfg, dict)
+    agent = cfg["agent"] | {"world_model": cfg["world_model"]}
+    assert leaves(agent) == leaves(dataclasses.asdict(RPGConfig())) | {".name"}
+    assert leaves(cfg["exploration"]) == leaves(dataclasses.asdict(RNDConfig())) | {".name"}
+    assert leaves(cfg["trainer"]) == leaves(dataclasses.asdict(TrainerConfig()))
+
+
+def test_environment_settings_reach_the_agent(composed: Composed) -> None:
+    run = paper(composed, "env=gym", "env.reward_scale=5", "env.obs_scale=0.5")
+    assert (run.agent.reward_scale, run.agent.obs_scale) == (5.0, 0.5)
+    assert run.env.name == "Pendulum-v1"
+
+
+def test_environments_in_the_configs_are_registered_or_need_a_package() -> None:
+    register_all()
+    for path in sorted((CONF / "env").glob("*.yaml")):
+        env_id = str(OmegaConf.load(path).id)  # type: ignore[union-attr]
+        if env_id.startswith("rpg/"):
+            assert env_id in gymnasium.registry, path.name
+
+
+@pytest.mark.parametrize("env", ["maze", "gym", "bandit"])
+@pytest.mark.parametrize("agent", AGENTS)
+def test_every_agent_runs_the_debug_preset(composed: Composed, tmp_path: Path, agent: str, env: str) -> None:
+    quick = ["trainer.steps=60", "trainer.seed_decisions=40", "trainer.picture_every=0"]
+    quick += ["trainer.eval_episodes=1", "trainer.eval_envs=1", "size.rnd_batch_size=16"]
+    row = train(composed("experiment=debug", f"agent={agent}", f"env={env}", *quick))
+    assert row["env_steps"] == 60
+    assert row["eval/deterministic/length"] == {"maze": 50, "gym": 200, "bandit": 1}[env]
+    assert (row["updates"] > 0) == (agent in LEARNERS) == ("loss/state" in row) == ("loss/rnd" in row)
+    assert ("loss/posterior" in row) == (agent == "rpg")
+    assert (tmp_path / "run" / "checkpoint.pt").exists()
