@@ -15,7 +15,7 @@ import signal
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -67,7 +67,7 @@ def train(cfg: DictConfig) -> dict[str, Any]:
         shown = {key: row[key] for key in _SHOWN if key in row}
         progress.update(int(row["env_steps"]), int(row["updates"]), shown)
 
-    with progress, _graceful_stop() as asked:
+    with closing(trainer), progress, _graceful_stop() as asked:
         start = time.perf_counter()
         row = trainer.train(lambda: bool(asked), show)
         if asked:

@@ -39,12 +39,30 @@ class Variant:
     column: str = ""  # name in the csv's agent column where it is not the agent itself
 
 
+_PUBLISHED = (
+    "env.tuning.entropy_target=null", "env.tuning.noise_correlation=0", "env.tuning.bonus=0.1",
+    "env.tuning.forgetting=0", "size.target_rate=0.005", "size.target_every=2", "size.lr=3e-4", "size.rnd_lr=3e-4",
+)  # fmt: skip
+
 VARIANTS = {
     "rpg": Variant("rpg", "gaussian12"),
     "mbsac": Variant("mbsac", "none"),
     "rpg-categorical": Variant(
         "rpg", "categorical12", ("agent.latent.gaussian=0", "agent.latent.categories=12"), seeds=(0,)
     ),
+    # What made the difference: one published choice put back at a time, then all of them.
+    "white-noise": Variant("rpg", "gaussian12", ("agent.noise_correlation=0",), steps=40_000, seeds=(0,)),
+    "low-entropy": Variant("rpg", "gaussian12", ("agent.entropy_target=-2",), steps=40_000, seeds=(0,)),
+    "small-bonus": Variant(
+        "rpg", "gaussian12", ("exploration.coefficient=0.1", "exploration.forgetting=0"), steps=40_000, seeds=(0,)
+    ),
+    "slow-target": Variant(
+        "rpg", "gaussian12", ("size.target_rate=0.005", "size.target_every=2"), steps=40_000, seeds=(0,)
+    ),
+    "published-tuning": Variant("rpg", "gaussian12", _PUBLISHED, steps=40_000, seeds=(0,)),
+    # What the smaller batch and width cost.
+    "paper-size": Variant("rpg", "gaussian12", ("size.target_rate=0.03", "size.target_every=1"), "paper", 10_000, (0,)),
+    # Policies that do not learn.
     "random": Variant("random", "none", steps=240_000),
     "sticky": Variant("sticky", "none", steps=240_000),
     "bump": Variant("bump", "none", steps=240_000),

@@ -13,6 +13,7 @@ import json
 import shutil
 import sys
 import time
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -45,7 +46,7 @@ def main() -> int:
             cfg = compose("config", overrides=["experiment=demo", *sys.argv[1:]])
         trainer, progress = assemble(cfg)
         start = time.perf_counter()
-        with progress:
+        with closing(trainer), progress:
             row = trainer.train(
                 should_stop=lambda: time.perf_counter() - start > _LIMIT_S,
                 on_row=lambda row: progress.update(

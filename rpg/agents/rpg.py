@@ -133,7 +133,7 @@ class RPG(Agent):
 
     def restore_episode_state(self, state: dict[str, Tensor]) -> None:
         """Continue from :meth:`episode_state`."""
-        self._noise = state["noise"].clone()
+        self._noise = state["noise"].to(self.device, copy=True)
 
     # -- learning --------------------------------------------------------------------------------------
 

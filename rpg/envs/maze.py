@@ -63,7 +63,7 @@ class Walls:
             # A point that travels on the wall's own line (through a gap) meets its end instead of its side.
             end_time = np.where(origin < low, low - origin, high - origin) / run
         on_line = (before == 0) & (after == 0)
-        changes_side = (before != 0) & (np.sign(before) != np.sign(after))
+        changes_side = np.sign(before) != np.sign(after)
         crosses = changes_side & (low <= crossing) & (crossing <= high)
         meets_end = on_line & (end_time >= 0) & (end_time <= 1)
         hit = crosses | meets_end

@@ -62,7 +62,7 @@ class Trainer:
         self._eval_envs: VectorEnv[Any, Any, Any] | None = None
         self._loggers, self._seed, self._plain = loggers, seed, plain_config or {}
         self._env_name, self._repeat = env_name, action_repeat
-        self._restorable = isinstance(envs, Restorable)
+        self._envs, self._restorable = envs, isinstance(envs, Restorable)
         self._runner = Runner(agent, envs, seed, env_name)
         self._replay = SegmentReplay(
             agent.obs_dim,
@@ -118,9 +118,10 @@ class Trainer:
                 self._evaluate()
             if self._due(self.config.log_every):
                 on_row(self._log())
-            if self._due(self.config.picture_every):
+            finished = self.env_steps >= self.config.steps  # then both follow below
+            if self._due(self.config.picture_every) and not finished:
                 self.draw()
-            self._due_checkpoint |= self._due(self.config.checkpoint_every)
+            self._due_checkpoint |= self._due(self.config.checkpoint_every) and not finished
             # Episodes of a simulator that cannot be restored are not torn apart by a checkpoint.
             if self._due_checkpoint and (self._restorable or self._runner.at_boundary):
                 self.save()
@@ -128,6 +129,13 @@ class Trainer:
             self.draw()
         self.save()
         return self._last_row
+
+    def close(self) -> None:
+        """Flush the loggers and end environments that run in other processes."""
+        self._loggers.close()
+        for envs in (self._envs, self._eval_envs):
+            if envs is not None:
+                envs.close()
 
     def _due(self, every: int) -> bool:
         """Whether the last vector step reached a multiple of ``every`` env steps, or the end."""
@@ -139,7 +147,8 @@ class Trainer:
     # -- collect and learn -----------------------------------------------------------------------------
 
     def start(self) -> None:
-        """Begin the first episodes."""
+        """Begin the first episodes, and the logs with them: a run killed before its first checkpoint left some."""
+        self._loggers.rewind(0)
         self._runner.reset()
         self._watch(self._runner.observations)
 
@@ -284,7 +293,7 @@ class Trainer:
         Returns:
             True if running episodes were restored too; False if new ones had to begin.
         """
-        state = load_checkpoint(self.checkpoint_path, self.agent.device)
+        state = load_checkpoint(self.checkpoint_path)  # on the CPU; every part moves its own
         self.decisions, self.updates, self._ticks = state["decisions"], state["updates"], state["ticks"]
         self._wall_before, self._clock = state["wall_s"], time.perf_counter()
         self._speed = (self.decisions, self.updates, self._wall_before)
@@ -294,15 +303,15 @@ class Trainer:
         self._replay.load_state_dict(state["replay"])
         if self._tracker is not None:
             self._tracker.load_state_dict(
-                {k: v.cpu().numpy() if isinstance(v, Tensor) else v for k, v in state["tracker"].items()}
+                {k: v.numpy() if isinstance(v, Tensor) else v for k, v in state["tracker"].items()}
             )
         self._sums, self._counts = state["sums"], state["counts"]
         self._episodes = [Episode(*e) for e in state["episodes"]]
         self._last_row = state["last_row"]
         self.agent.restore_episode_state(state["episode_state"])
-        torch.set_rng_state(state["rng"].cpu())
+        torch.set_rng_state(state["rng"])
         if state["cuda_rng"] is not None:
-            torch.cuda.set_rng_state(state["cuda_rng"].cpu(), self.agent.device)
+            torch.cuda.set_rng_state(state["cuda_rng"], self.agent.device)
         restored = self._runner.load_state_dict(state["runner"])
         if not restored:
             self._replay.cut()

@@ -334,6 +334,50 @@ def test_reward_ramp_passes_its_marks(env_steps: int, factor: float) -> None:
     assert RewardRamp().factor_at(env_steps) == 1.0
 
 
+# -- action noise --------------------------------------------------------------------------------------
+
+
+def drawn_noise(agent: RPG, n: int, steps: int) -> Tensor:
+    """What replaced the standard normal in each action, (steps, n, action_dim), from one state and z."""
+    obs, z = torch.zeros(n, 3), torch.zeros(n, agent.latent_dim)
+    agent.begin_episodes(obs, torch.ones(n, dtype=torch.bool), z)
+    distribution = agent.policy(agent.model.encoder(agent._input(obs)), z)
+    actions = torch.stack([agent.from_env(agent.act(obs, z)) for _ in range(steps)])
+    return ((actions.atanh() - distribution.mean) / distribution.log_std.exp()).detach()
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.9])
+def test_action_noise_has_the_stated_correlation_and_the_spread_of_the_policy(rho: float) -> None:
+    noise = drawn_noise(make(replace(TINY, noise_correlation=rho)), n=4000, steps=3)
+    assert noise.std(dim=(1, 2)).tolist() == pytest.approx([1.0] * 3, abs=0.05)
+    assert float((noise[0] * noise[1]).mean()) == pytest.approx(rho, abs=0.05)
+    assert float((noise[0] * noise[2]).mean()) == pytest.approx(rho**2, abs=0.05)
+
+
+def test_a_new_episode_begins_with_new_noise() -> None:
+    agent = make(replace(TINY, noise_correlation=0.99))
+    obs, z = torch.zeros(1000, 3), torch.zeros(1000, 2)
+    agent.begin_episodes(obs, torch.ones(1000, dtype=torch.bool), z)
+    before = agent.from_env(agent.act(obs, z)).atanh()
+    new = torch.arange(1000) < 500
+    agent.begin_episodes(obs, new, z)
+    after = agent.from_env(agent.act(obs, z)).atanh()
+    for where, correlation in ((new, 0.0), (~new, 0.99)):
+        both = torch.stack([before[where][:, 0], after[where][:, 0]])
+        assert float(torch.corrcoef(both)[0, 1]) == pytest.approx(correlation, abs=0.15)
+
+
+def test_noise_of_running_episodes_can_be_put_back() -> None:
+    agent = make(replace(TINY, noise_correlation=0.9))
+    obs, z = torch.zeros(4, 3), torch.zeros(4, 2)
+    held, rng = agent.episode_state(), torch.get_rng_state()
+    first = agent.act(obs, z)
+    agent.begin_episodes(torch.zeros(7, 3), torch.ones(7, dtype=torch.bool), torch.zeros(7, 2))
+    agent.restore_episode_state(held)
+    torch.set_rng_state(rng)
+    assert torch.equal(agent.act(obs, z), first)
+
+
 # -- spaces --------------------------------------------------------------------------------------------
 
 

@@ -54,7 +54,7 @@ def read_image(path: Path) -> Picture:
 
 @contextmanager
 def file_size_limit(size: int) -> Iterator[None]:
-    """The kernel refuses to let a file grow past ``size`` bytes, after writing what fits: like a full disk."""
+    """Files cannot grow past ``size`` bytes; what fits is written first, as on a full disk."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
     try:
