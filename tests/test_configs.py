@@ -90,7 +90,7 @@ def test_every_agent_runs_the_debug_preset(composed: Composed, tmp_path: Path, a
     quick = ["trainer.steps=60", "trainer.seed_decisions=40", "trainer.picture_every=0"]
     quick += ["trainer.eval_episodes=1", "trainer.eval_envs=1", "size.rnd_batch_size=16"]
     if (agent, env) == ("bump", "bandit"):
-        quick.append("agent.position=1")  # it looks at two entries otherwise; here there is one
+        quick.append("+agent.position=1")  # it looks at two entries otherwise; here there is one
     row = train(composed("experiment=debug", f"agent={agent}", f"env={env}", *quick))
     assert row["env_steps"] == 60
     assert row["eval/deterministic/length"] == {"maze": 50, "gym": 200, "bandit": 1}[env]

@@ -341,5 +341,5 @@ def test_missing_wandb_names_the_pip_command(tmp_path: Path, monkeypatch: pytest
 
     monkeypatch.delitem(sys.modules, "wandb", raising=False)
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(RPGError, match=r"pip install '.*\[wandb\]'"):
+    with pytest.raises(RPGError, match=r"pip install -e '.*\[wandb\]'"):
         WandbSink(tmp_path)

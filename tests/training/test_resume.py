@@ -110,6 +110,10 @@ def test_a_resumed_run_equals_an_uninterrupted_one(
     assert_equal_runs(tmp_path / "run", straight)
 
 
+def test_a_run_told_to_draw_nothing_draws_nothing(straight: Path) -> None:
+    assert not (straight / "pictures").exists()
+
+
 def test_a_resumed_run_with_a_learned_prior_equals_an_uninterrupted_one(
     composed: Composed, tmp_path: Path
 ) -> None:
@@ -198,43 +202,33 @@ def test_another_runs_folder_is_refused_and_kept(composed: Composed, tmp_path: P
 
 def wait_for_rows(process: subprocess.Popen[str], run: Path, count: int) -> None:
     log = run / "metrics.jsonl"
-    deadline = time.monotonic() + 120
-    while process.poll() is None and time.monotonic() < deadline:
+    while process.poll() is None:
         if log.exists() and log.read_bytes().count(b"\n") >= count:
             return
         time.sleep(0.005)
-    pytest.fail(f"ended (or hung) before row {count}: {process.communicate()}")
+    pytest.fail(f"ended before row {count}: {process.communicate()}")
 
 
-def test_survives_kill_at_any_moment(command: Command, straight_real: Path, tmp_path: Path) -> None:
+@pytest.mark.timeout(1200)  # starts the command five times, which takes long on a busy machine
+def test_the_command_survives_kills_and_signals_at_any_moment(
+    command: Command, composed: Composed, straight_real: Path, tmp_path: Path
+) -> None:
     run = tmp_path / "run"
     rng = np.random.default_rng()
-    for count in (1, int(rng.integers(4, 9)), int(rng.integers(10, 15))):
+    ends = (signal.SIGKILL, signal.SIGTERM, signal.SIGKILL, signal.SIGINT, signal.SIGKILL)
+    for end, count in zip(ends, (1, 5, 8, 11, 14), strict=True):
         process = command("rpg.train", f"run_dir={run}", "device=cpu", "logger=files", *REAL)
         wait_for_rows(process, run, count)
         time.sleep(rng.uniform(0, 0.1))
-        process.kill()
-        process.communicate()
-        assert process.returncode == -signal.SIGKILL
-    process = command("rpg.train", f"run_dir={run}", "device=cpu", "logger=files", *REAL)
-    _, err = process.communicate(timeout=120)
-    assert process.returncode == 0, err
-    assert_equal_runs(run, straight_real)
-
-
-@pytest.mark.parametrize(("number", "name"), [(signal.SIGINT, "Ctrl-C"), (signal.SIGTERM, "SIGTERM")])
-def test_a_polite_signal_saves_and_tells_how_to_resume(
-    command: Command, composed: Composed, straight_real: Path, tmp_path: Path, number: int, name: str
-) -> None:
-    run = tmp_path / "run"
-    process = command("rpg.train", f"run_dir={run}", "device=cpu", "logger=files", *REAL)
-    wait_for_rows(process, run, 3)
-    process.send_signal(number)
-    out, err = process.communicate(timeout=60)
-    assert process.returncode == 130
-    assert f"stopped by {name}" in out
-    assert "resume with" in out
-    assert f"run_dir={run}" in out
-    assert "Traceback" not in err
-    train(composed(*REAL))
+        process.send_signal(end)
+        out, err = process.communicate()
+        if end == signal.SIGKILL:
+            assert process.returncode == -signal.SIGKILL
+            continue
+        assert process.returncode == 130
+        assert f"stopped by {'Ctrl-C' if end == signal.SIGINT else 'SIGTERM'}" in out
+        assert "resume with" in out
+        assert f"run_dir={run}" in out
+        assert "Traceback" not in err
+    assert train(composed(*REAL))["env_steps"] == 900
     assert_equal_runs(run, straight_real)

@@ -193,6 +193,7 @@ def test_evaluating_does_not_change_what_is_learned(
             "trainer.seed_decisions=40",
             "trainer.picture_every=0",
         ]
+        quick += ["trainer.eval_episodes=1", "trainer.eval_envs=1"]
         train(composed(*quick, *prior, f"trainer.eval_every={every}", f"run_dir={run_dir}"))
         agent = load_checkpoint(run_dir / "checkpoint.pt")["agent"]
         return {f"{part}.{k}": v for part in ("model", "policy", "prior") for k, v in agent[part].items()}
