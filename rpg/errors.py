@@ -31,4 +31,7 @@ def require_extra(module: str, extra: str, purpose: str) -> None:
     import importlib.util
 
     if importlib.util.find_spec(module) is None:
-        raise RPGError(f"{purpose} needs the package '{module}': pip install -e '.[{extra}]' in a checkout, or pip install {module}")
+        raise RPGError(
+            f"{purpose} needs the package '{module}': pip install -e '.[{extra}]' in a checkout, "
+            f"or pip install {module}"
+        )

@@ -54,14 +54,20 @@ VARIANTS = {
     "white-noise": Variant("rpg", "gaussian12", ("agent.noise_correlation=0",), steps=40_000, seeds=(0,)),
     "low-entropy": Variant("rpg", "gaussian12", ("agent.entropy_target=-2",), steps=40_000, seeds=(0,)),
     "small-bonus": Variant(
-        "rpg", "gaussian12", ("exploration.coefficient=0.1", "exploration.forgetting=0"), steps=40_000, seeds=(0,)
+        "rpg",
+        "gaussian12",
+        ("exploration.coefficient=0.1", "exploration.forgetting=0"),
+        steps=40_000,
+        seeds=(0,),
     ),
     "slow-target": Variant(
         "rpg", "gaussian12", ("size.target_rate=0.005", "size.target_every=2"), steps=40_000, seeds=(0,)
     ),
     "published-tuning": Variant("rpg", "gaussian12", _PUBLISHED, steps=40_000, seeds=(0,)),
     # What the smaller batch and width cost.
-    "paper-size": Variant("rpg", "gaussian12", ("size.target_rate=0.03", "size.target_every=1"), "paper", 10_000, (0,)),
+    "paper-size": Variant(
+        "rpg", "gaussian12", ("size.target_rate=0.03", "size.target_every=1"), "paper", 10_000, (0,)
+    ),
     # Policies that do not learn.
     "random": Variant("random", "none", steps=240_000),
     "sticky": Variant("sticky", "none", steps=240_000),

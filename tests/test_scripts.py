@@ -39,9 +39,20 @@ def test_demo_draws_and_judges_itself(tmp_path: Path) -> None:
 
 def test_benchmark_line_says_what_was_measured(tmp_path: Path) -> None:
     line = json.loads(
-        run(tmp_path, str(ROOT / "benchmarks" / "learning.py"), "--size", "fast", "--threads", "1", "--repeats", "1")
+        run(
+            tmp_path,
+            str(ROOT / "benchmarks" / "learning.py"),
+            "--size",
+            "fast",
+            "--threads",
+            "1",
+            "--repeats",
+            "1",
+        )
     )
-    needed = "name median repeats unit threads dtype matmul_gflops share cpu commit updates_per_s env_steps_per_s"
+    needed = (
+        "name median repeats unit threads dtype matmul_gflops share cpu commit updates_per_s env_steps_per_s"
+    )
     assert set(needed.split()) <= set(line)
     assert line["updates_per_s"] > 0
     assert line["env_steps_per_s"] > 0

@@ -15,6 +15,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 from torch import Tensor
 
+from rpg.envs.single import SingleEnv
 from rpg.errors import NonFiniteError, RPGError
 
 Array = NDArray[Any]
@@ -137,38 +138,13 @@ class BanditVectorEnv(VectorEnv[Array, Array, Array]):
         return np.ones((self.num_envs, 1), dtype=np.float32)
 
 
-class BanditEnv(gymnasium.Env[Array, Array]):
+class BanditEnv(SingleEnv):
     """One bandit: :class:`BanditVectorEnv` with a batch of one, for gymnasium's single-env tools."""
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 (as gymnasium declares it)
 
     def __init__(self, render_mode: None = None) -> None:
-        self._batch = BanditVectorEnv(1)
-        self.render_mode = render_mode
-        self.observation_space = self._batch.single_observation_space
-        self.action_space = self._batch.single_action_space
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Array, dict[str, Any]]:
-        """Start the next one-step episode."""
-        super().reset(seed=seed)
-        observations, info = self._batch.reset()
-        return observations[0], info
-
-    def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
-        """See :meth:`BanditVectorEnv.step`; ``action`` (1,)."""
-        observations, reward, terminated, truncated, info = self._batch.step(np.asarray(action)[None])
-        single_info = {key: value[0] for key, value in info.items()}
-        return observations[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), single_info
-
-    def get_state(self) -> dict[str, Any]:
-        """See :meth:`BanditVectorEnv.get_state`."""
-        return self._batch.get_state()
-
-    def set_state(self, state: dict[str, Any]) -> None:
-        """See :meth:`BanditVectorEnv.set_state`."""
-        self._batch.set_state(state)
+        super().__init__(BanditVectorEnv(1), render_mode)
 
 
 def register_bandit() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import gymnasium
 import numpy as np
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode, VectorEnv
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 from rpg.envs.layouts import LAYOUTS, MazeLayout
 from rpg.envs.maze_picture import Frame, MazeCanvas
 from rpg.envs.maze_tracker import MazeTracker
+from rpg.envs.single import SingleEnv
 from rpg.errors import NonFiniteError, RPGError, nearest
 from rpg.exploration.objects import ObjectsOfInterest
 
@@ -247,7 +247,7 @@ def _checked_goal(goal: Sequence[float], layout: MazeLayout) -> Floats:
     return place
 
 
-class MazeEnv(gymnasium.Env[Array, Array]):
+class MazeEnv(SingleEnv):
     """One point in a maze: :class:`MazeVectorEnv` with a batch of one, for gymnasium's single-env tools."""
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 15}  # noqa: RUF012
@@ -260,40 +260,17 @@ class MazeEnv(gymnasium.Env[Array, Array]):
         goal_radius: float = 0.5,
         render_mode: str | None = None,
     ) -> None:
-        self._batch = MazeVectorEnv(1, layout, episode_steps, goal, goal_radius, render_mode)
-        self.render_mode = render_mode
-        self.observation_space = self._batch.single_observation_space
-        self.action_space = self._batch.single_action_space
-        self.objects_of_interest = self._batch.objects_of_interest
-        self.obs_scale = self._batch.obs_scale
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Array, dict[str, Any]]:
-        """Return to the start."""
-        super().reset(seed=seed)
-        observations, info = self._batch.reset()
-        return observations[0], info
-
-    def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
-        """See :meth:`MazeVectorEnv.step`; ``action`` (2,)."""
-        observations, reward, terminated, truncated, info = self._batch.step(np.asarray(action)[None])
-        single_info = {key: value[0] for key, value in info.items()}
-        return observations[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), single_info
+        batch = MazeVectorEnv(1, layout, episode_steps, goal, goal_radius, render_mode)
+        super().__init__(batch, render_mode)
+        self.objects_of_interest = batch.objects_of_interest
+        self.obs_scale = batch.obs_scale
 
     def render(self) -> Frame | None:
         """A uint8 (256, 256, 3) RGB frame, or None without a render mode."""
         frames = self._batch.render()
         return None if frames is None else frames[0]
 
-    def get_state(self) -> dict[str, Any]:
-        """See :meth:`MazeVectorEnv.get_state`."""
-        return self._batch.get_state()
-
-    def set_state(self, state: dict[str, Any]) -> None:
-        """See :meth:`MazeVectorEnv.set_state`."""
-        self._batch.set_state(state)
-
     def make_tracker(self) -> MazeTracker:
         """See :meth:`MazeVectorEnv.make_tracker`."""
-        return self._batch.make_tracker()
+        tracker: MazeTracker = self._batch.make_tracker()
+        return tracker

@@ -178,13 +178,9 @@ def test_every_observation_is_watched_once_and_segments_are_relabelled(tmp_path:
     assert len(watched) == 90 + int(episodes)
 
 
-@pytest.mark.parametrize(
-    "prior", [[], ["agent.latent.gaussian=0", "agent.latent.categories=3", "agent.prior.mode=policy_gradient"]],
-    ids=["fixed prior", "learned prior"],
-)  # fmt: skip
-def test_evaluating_does_not_change_what_is_learned(
-    composed: Composed, tmp_path: Path, prior: list[str]
-) -> None:
+def test_evaluating_does_not_change_what_is_learned(composed: Composed, tmp_path: Path) -> None:
+    prior = ["agent.latent.gaussian=0", "agent.latent.categories=3", "agent.prior.mode=policy_gradient"]
+
     def learned(every: int) -> dict[str, Any]:
         run_dir = tmp_path / f"every{every}"
         quick = [
