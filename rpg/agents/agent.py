@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import gymnasium as gym
@@ -30,6 +32,7 @@ class Agent:
     latent_dim = 0
     batch_size = 0
     horizon = 1
+    _evaluating = False
 
     def __init__(
         self,
@@ -39,14 +42,14 @@ class Agent:
     ) -> None:
         if not isinstance(observation_space, gym.spaces.Box) or len(observation_space.shape) != 1:
             raise RPGError(
-                f"observation space {observation_space}: a flat Box is needed; wrap the environment with "
+                f"observation space {_brief(observation_space)}: a flat Box is needed; wrap the environment with "
                 "gymnasium.wrappers.FlattenObservation"
             )
         if not isinstance(action_space, gym.spaces.Box) or len(action_space.shape) != 1:
-            raise RPGError(f"action space {action_space}: a flat Box of continuous actions is needed")
+            raise RPGError(f"action space {_brief(action_space)}: a flat Box of continuous actions is needed")
         if not (np.isfinite(action_space.low).all() and np.isfinite(action_space.high).all()):
             raise RPGError(
-                f"action space {action_space}: bounds must be finite; wrap the environment with "
+                f"action space {_brief(action_space)}: bounds must be finite; wrap the environment with "
                 "gymnasium.wrappers.RescaleAction"
             )
         self.obs_dim = observation_space.shape[0]
@@ -54,6 +57,7 @@ class Agent:
         self.device = torch.device(device)
         low = torch.as_tensor(action_space.low, dtype=torch.float32, device=self.device)
         high = torch.as_tensor(action_space.high, dtype=torch.float32, device=self.device)
+        self._action_low, self._action_high = low, high
         self._action_middle = (high + low) / 2
         self._action_half = (high - low) / 2
 
@@ -98,10 +102,30 @@ class Agent:
     def restore_episode_state(self, state: dict[str, Tensor]) -> None:
         """Continue from :meth:`episode_state`."""
 
+    @contextmanager
+    def evaluating(self) -> Iterator[None]:
+        """Act in other environments for a while: nothing is remembered, running episodes go on afterwards."""
+        held = self.episode_state()
+        self._evaluating = True
+        try:
+            yield
+        finally:
+            self._evaluating = False
+            self.restore_episode_state(held)
+
     def to_env(self, action: Tensor) -> Tensor:
         """From (-1, 1) to the environment's bounds."""
-        return self._action_middle + self._action_half * action
+        scaled = self._action_middle + self._action_half * action
+        # Rounding must not carry a saturated action past its bound.
+        return torch.minimum(torch.maximum(scaled, self._action_low), self._action_high)
 
     def from_env(self, action: Tensor) -> Tensor:
         """From the environment's bounds to [-1, 1]."""
-        return (action - self._action_middle) / self._action_half
+        # An action whose bounds coincide has no half range to divide by; it is always in the middle.
+        return (action - self._action_middle) / torch.where(self._action_half > 0, self._action_half, 1.0)
+
+
+def _brief(space: gym.Space[Any]) -> str:
+    """The space in one line, without the entries of its bounds."""
+    shape = f" of shape {space.shape}" if space.shape else ""
+    return f"{type(space).__name__}{shape}"

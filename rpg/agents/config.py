@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from rpg.errors import RPGError
@@ -37,6 +38,11 @@ class PriorConfig:
     def __post_init__(self) -> None:
         if self.mode not in ("fixed", "policy_gradient", "regression"):
             raise RPGError(f"agent.prior.mode={self.mode!r}: choose fixed, policy_gradient or regression")
+        if self.entropy_weight < 0 or self.batch_size < 1 or self.every < 1 or not self.lr > 0:
+            raise RPGError(
+                f"agent.prior: entropy_weight={self.entropy_weight} must be >= 0, batch_size={self.batch_size} and "
+                f"every={self.every} at least 1, lr={self.lr} > 0"
+            )
         if self.decay_start is not None and self.decay_end <= self.decay_start:
             raise RPGError(
                 f"agent.prior: decay_end={self.decay_end} must come after decay_start={self.decay_start}"
@@ -73,6 +79,11 @@ class RewardRamp:
         rise = min(env_steps / self.first, 1.0) * self.level
         finish = (env_steps - self.first) / (self.second - self.first)
         return rise + min(max(finish, 0.0), 1.0) * (1.0 - self.level)
+
+
+_COUNTS = ("batch_size", "width", "actor_every", "actor_horizon", "target_horizon")
+_NOT_NEGATIVE = ("alpha", "beta", "horizon_decay", "observation_frequencies")
+_POSITIVE = ("lr", "grad_clip", "base_std", "max_alpha")
 
 
 @dataclass
@@ -147,18 +158,11 @@ class RPGConfig:
             raise RPGError(f"agent.actor_value={self.actor_value!r}: choose first, mean or min")
         if self.precision not in ("float32", "bfloat16"):
             raise RPGError(f"agent.precision={self.precision!r}: choose float32 or bfloat16")
-        for name in ("batch_size", "width", "actor_every", "actor_horizon", "target_horizon"):
-            if getattr(self, name) < 1:
-                raise RPGError(f"agent.{name}={getattr(self, name)}: must be at least 1")
-        if not 0 <= self.noise_correlation < 1:
-            raise RPGError(f"agent.noise_correlation={self.noise_correlation}: must lie in [0, 1)")
-        if not 0 <= self.gamma <= 1:
-            raise RPGError(f"agent.gamma={self.gamma}: must lie in [0, 1]")
-        if self.alpha < 0 or self.beta < 0 or self.lr <= 0 or self.grad_clip <= 0:
-            raise RPGError(
-                f"agent: alpha={self.alpha}, beta={self.beta} must be >= 0; "
-                f"lr={self.lr}, grad_clip={self.grad_clip} > 0"
-            )
+        self._require("must be at least 1", lambda v: v >= 1, *_COUNTS)
+        self._require("must lie in [0, 1)", lambda v: 0 <= v < 1, "noise_correlation")
+        self._require("must lie in [0, 1]", lambda v: 0 <= v <= 1, "gamma")
+        self._require("must not be negative", lambda v: v >= 0, *_NOT_NEGATIVE)
+        self._require("must be positive", lambda v: v > 0, *_POSITIVE)
         if self.prior.mode == "regression" and (self.latent.gaussian or not self.latent.categories):
             raise RPGError(
                 "agent.prior.mode=regression: needs a purely categorical latent (latent.gaussian=0)"
@@ -167,3 +171,8 @@ class RPGConfig:
             raise RPGError(
                 "agent.prior.mode=regression: entropy_weight is the softmax temperature, must be > 0"
             )
+
+    def _require(self, rule: str, holds: Callable[[float], bool], *names: str) -> None:
+        for name in names:  # NaN holds for no rule
+            if not holds(getattr(self, name)):
+                raise RPGError(f"agent.{name}={getattr(self, name)}: {rule}")

@@ -95,7 +95,8 @@ class RPG(Agent):
     @torch.no_grad()
     def begin_episodes(self, obs: Tensor, mask: Tensor, latent: Tensor) -> Tensor:
         """See :meth:`Agent.begin_episodes`; a learned pi(z|s1) also remembers the start states."""
-        self.prior.remember(obs[mask])
+        if not self._evaluating:
+            self.prior.remember(obs[mask])
         if self.config.noise_correlation:
             fresh = torch.randn(len(obs), self.action_dim, device=self.device)
             if len(self._noise) != len(obs):

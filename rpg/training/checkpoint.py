@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import pickle
+import struct
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,12 @@ from rpg.errors import CheckpointError, RPGError
 
 FORMAT = "rpg-checkpoint"
 VERSION = 1
+
+# What reading arbitrary bytes as a checkpoint has been seen to raise.
+_DAMAGE = (
+    OSError, RuntimeError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, AssertionError,
+    EOFError, ImportError, MemoryError, pickle.UnpicklingError, struct.error,
+)  # fmt: skip
 
 
 def save_checkpoint(path: Path, content: dict[str, Any]) -> None:
@@ -29,7 +37,8 @@ def save_checkpoint(path: Path, content: dict[str, Any]) -> None:
             os.fsync(file.fileno())
         temporary.replace(path)
     except (OSError, RuntimeError) as error:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
         reason = " ".join(str(error).split())
         raise RPGError(
             f"checkpoint {path}: cannot be written ({reason}); free space or choose another run_dir, "
@@ -48,7 +57,7 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError as error:
         raise CheckpointError(f"checkpoint {path}: no such file; is this a run folder?") from error
-    except (OSError, RuntimeError, ValueError, KeyError, EOFError, pickle.UnpicklingError) as error:
+    except _DAMAGE as error:
         # Torch's own message may suggest to load without safety; it is not repeated.
         raise CheckpointError(f"checkpoint {path}: damaged, or not written by rpg; {remedy}") from error
     if not isinstance(content, dict) or content.get("format") != FORMAT:

@@ -66,16 +66,18 @@ class SegmentReplay:
 
         ``next_obs`` is the true successor, also where the episode ended (not the next reset).
         """
-        ended = self._column(terminated) + self._column(truncated) > 0
+        obs_dim, _, action_dim, _, latent_dim, *_ = self._widths
+        ended_now = self._matrix(terminated, 1, "terminated")
+        ended = ended_now + self._matrix(truncated, 1, "truncated") > 0
         row = self._data[self._head]
         torch.cat(
             [
-                self._matrix(obs),
-                self._matrix(next_obs),
-                self._matrix(action),
-                self._column(reward),
-                latent.to(row),
-                self._column(terminated),
+                self._matrix(obs, obs_dim, "obs"),
+                self._matrix(next_obs, obs_dim, "next_obs"),
+                self._matrix(action, action_dim, "action"),
+                self._matrix(reward, 1, "reward"),
+                self._matrix(latent, latent_dim, "latent"),
+                ended_now,
                 ended.to(row),
                 self._episode_step,
             ],
@@ -154,14 +156,16 @@ class SegmentReplay:
                 f"replay: stored rows {tuple(data.shape)} do not fit into {tuple(self._data.shape)}; "
                 "resume with the same environment, latent space, num_envs and capacity"
             )
-        self._data[: len(data)] = data
+        # Oldest row first, so that a full ring also fits into a larger one.
+        self._data[: len(data)] = data.roll(-state["head"], 0) if state["head"] < len(data) else data
         self._filled = len(data)
-        self._head = state["head"]
+        self._head = len(data) % self._rows
         self._episode_step.copy_(state["episode_step"])
 
-    def _matrix(self, values: np.ndarray | Tensor) -> Tensor:
+    def _matrix(self, values: np.ndarray | Tensor, width: int, name: str) -> Tensor:
         tensor = torch.as_tensor(values, dtype=torch.float32, device=self._data.device)
-        return tensor.reshape(self._num_envs, -1)
-
-    def _column(self, values: np.ndarray | Tensor) -> Tensor:
-        return self._matrix(values)
+        if len(tensor) != self._num_envs or tensor.numel() != self._num_envs * width:
+            raise RPGError(
+                f"replay: {name} has shape {tuple(tensor.shape)}, expected {self._num_envs} rows of {width}"
+            )
+        return tensor.reshape(self._num_envs, width)

@@ -196,8 +196,7 @@ def evaluate(
     per_env = -(-episodes // envs.num_envs)
     devices = [agent.device] if agent.device.type == "cuda" else []
     finished: list[Episode] = []
-    held = agent.episode_state()
-    with torch.random.fork_rng(devices):
+    with agent.evaluating(), torch.random.fork_rng(devices):
         torch.manual_seed(seed)
         runner = Runner(agent, envs, seed, name)
         runner.reset()
@@ -209,5 +208,4 @@ def evaluate(
                 if counts[row] < per_env:
                     finished.append(episode)
                 counts[row] += 1
-    agent.restore_episode_state(held)
     return finished

@@ -78,7 +78,8 @@ class Trainer:
         self._counts: dict[str, int] = {}
         self._episodes: list[Episode] = []
         self._last_row: Row = {}
-        self._due_checkpoint = False
+        self._due_checkpoint = self._started = False
+        self._saved_at = 0  # decisions
         self._wall_before, self._clock = 0.0, time.perf_counter()
         self._speed = (0, 0, 0.0)  # decisions, updates, wall_s at the last log row
 
@@ -107,7 +108,7 @@ class Trainer:
             The last row logged.
         """
         self._clock = time.perf_counter()
-        if self.decisions == 0:
+        if not self._started:
             self.start()
         while self.env_steps < self.config.steps and not should_stop():
             self.collect_once()
@@ -122,10 +123,9 @@ class Trainer:
             if self._due(self.config.picture_every) and not finished:
                 self.draw()
             self._due_checkpoint |= self._due(self.config.checkpoint_every) and not finished
-            # Episodes of a simulator that cannot be restored are not torn apart by a checkpoint.
-            if self._due_checkpoint and (self._restorable or self._runner.at_boundary):
+            if self._due_checkpoint and self._may_save():
                 self.save()
-        if self.env_steps >= self.config.steps:
+        if self.env_steps >= self.config.steps and self.config.picture_every:
             self.draw()
         self.save()
         return self._last_row
@@ -148,6 +148,7 @@ class Trainer:
 
     def start(self) -> None:
         """Begin the first episodes, and the logs with them: a run killed before its first checkpoint left some."""
+        self._started = True
         self._loggers.rewind(0)
         self._runner.reset()
         self._watch(self._runner.observations)
@@ -158,7 +159,8 @@ class Trainer:
         self._replay.add(*transition)
         self._watch(transition.next_obs)
         if episodes:
-            self._watch(self._runner.observations)
+            begun = np.logical_or(transition.terminated, transition.truncated)
+            self._watch(self._runner.observations[begun])
             self._episodes += episodes
         self.decisions += self._runner.num_envs
 
@@ -249,6 +251,11 @@ class Trainer:
 
     # -- survive ---------------------------------------------------------------------------------------
 
+    def _may_save(self) -> bool:
+        """Episodes of a simulator that cannot be restored are not torn apart, unless they never align."""
+        overdue = (self.decisions - self._saved_at) * self._repeat >= 2 * self.config.checkpoint_every
+        return self._restorable or self._runner.at_boundary or overdue
+
     def save(self) -> None:
         """Write the checkpoint; refuses if learning has gone non-finite since the last one."""
         bad = [key for key, value in self._sums.items() if not bool(value.isfinite())]
@@ -258,7 +265,7 @@ class Trainer:
                 f"(seed {self._seed}); no checkpoint was written, the previous one is untouched"
             )
         save_checkpoint(self.checkpoint_path, self.state_dict())
-        self._due_checkpoint = False
+        self._due_checkpoint, self._saved_at = False, self.decisions
 
     def state_dict(self) -> dict[str, Any]:
         """Everything the run depends on, as tensors and plain data."""
@@ -295,6 +302,7 @@ class Trainer:
         """
         state = load_checkpoint(self.checkpoint_path)  # on the CPU; every part moves its own
         self.decisions, self.updates, self._ticks = state["decisions"], state["updates"], state["ticks"]
+        self._started, self._saved_at = True, self.decisions
         self._wall_before, self._clock = state["wall_s"], time.perf_counter()
         self._speed = (self.decisions, self.updates, self._wall_before)
         self.agent.load_state_dict(state["agent"])

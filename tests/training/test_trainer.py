@@ -185,7 +185,7 @@ def test_evaluating_does_not_change_what_is_learned(composed: Composed, tmp_path
         run_dir = tmp_path / f"every{every}"
         quick = [
             "experiment=debug",
-            "trainer.steps=200",
+            "trainer.steps=100",
             "trainer.seed_decisions=40",
             "trainer.picture_every=0",
         ]
