@@ -37,7 +37,12 @@ format: $(VENV)/.dev
 	$(BIN)/ruff format .
 
 docs: $(VENV)/.docs
-	$(BIN)/mkdocs build --strict
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
+# Redraws the published figures from results/.
+figures: $(VENV)/.core
+	$(BIN)/python scripts/figure_maze.py draw
+	$(BIN)/python scripts/figure_bandit.py --redraw
 
 bench: $(VENV)/.core
 	$(BIN)/python benchmarks/learning.py --out benchmarks/output

@@ -54,10 +54,15 @@ def main() -> None:
             for _ in range(4):
                 trainer.learn_once()
 
+        def agent_block() -> None:
+            for _ in range(4):
+                trainer.update_agent()
+
         with FlopCounterMode(display=False) as counter:
             block()
         gflop = counter.get_total_flops() / 4 / 1e9
         per_update = seconds(block, args.repeats) / 4
+        agent_alone = seconds(agent_block, args.repeats) / 4
         step = seconds(trainer.collect_once, args.repeats)
         limit = max(limit, matmul_gflops(3 * trainer.agent.batch_size, cfg.agent.width, args.device))
         envs = cfg.env.num_envs
@@ -73,6 +78,7 @@ def main() -> None:
         "cpu": cpu_name() if args.device == "cpu" else torch.cuda.get_device_name(),
         "commit": commit(),
         "updates_per_s": round(1 / per_update, 3),
+        "agent_updates_per_s": round(1 / agent_alone, 3),  # without the predictor step of the bonus
         "env_steps_per_s": round(envs / (step + per_update * envs / cfg.trainer.decisions_per_update), 2),
         "gflop_per_update": round(gflop, 3),
         "batch_size": trainer.agent.batch_size,

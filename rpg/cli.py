@@ -56,7 +56,7 @@ def check_overrides(args: list[str]) -> None:
         "--package",
         "-p",
     }
-    if flags_with_value & set(args) or "--info" in args:
+    if flags_with_value & {a.split("=")[0] for a in args} or "--info" in args:
         return  # the user brings configs of their own, or asks Hydra about itself
     if stray and "--cfg" not in args and "-c" not in args:
         raise RPGError(f"'{stray[0]}': overrides look like key=value, for instance agent=rpg")
@@ -71,7 +71,7 @@ def check_overrides(args: list[str]) -> None:
     for override in chosen:
         options = [p.stem for p in (_CONF / override.key_or_group).glob("*.yaml")]
         for value in _values(override):
-            if value not in ("null", "None", None) and str(value) not in options:
+            if str(value) not in options:
                 raise RPGError(f"{override.key_or_group}={value}: unknown; {nearest(str(value), options)}")
     base = _compose([f"{o.key_or_group}={_values(o)[0]}" for o in chosen])
     for override in overrides:

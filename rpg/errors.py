@@ -18,12 +18,16 @@ class NonFiniteError(RPGError):
     """An observation, reward, action or loss is NaN or infinite."""
 
 
+_LISTED = 40
+
+
 def nearest(name: str, options: Iterable[str]) -> str:
     """Return a hint such as ``did you mean 'maze'? known: maze, tree`` for an unknown ``name``."""
     known = sorted(options)
     close = difflib.get_close_matches(name, known, n=3, cutoff=0.5)
     hint = f"did you mean {' or '.join(repr(c) for c in close)}? " if close else ""
-    return f"{hint}known: {', '.join(known)}"
+    listed = ", ".join(known) if len(known) <= _LISTED else f"{len(known)} names, such as {known[0]}"
+    return f"{hint}known: {listed}"
 
 
 def require_extra(module: str, extra: str, purpose: str) -> None:

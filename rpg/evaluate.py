@@ -30,6 +30,10 @@ def evaluate_run(run_dir: Path, episodes: int, seed: int, num_envs: int | None =
         RPGError: not a run folder, or a damaged checkpoint.
     """
     state = load_checkpoint(run_dir / "checkpoint.pt")
+    if not state["config"]:
+        raise RPGError(
+            f"{run_dir}: its checkpoint has no config, so the agent cannot be rebuilt; use rpg.training"
+        )
     run = parse_config(OmegaConf.create(state["config"]))
     envs = make_envs(run.env, num_envs or run.trainer.eval_envs)
     agent, _ = build_agent(run, envs)
@@ -38,6 +42,7 @@ def evaluate_run(run_dir: Path, episodes: int, seed: int, num_envs: int | None =
     for mode, deterministic in (("deterministic", True), ("stochastic", False)):
         finished = evaluate(agent, envs, episodes, seed, deterministic, run.env.name)
         result |= summarize(finished, f"eval/{mode}")
+    envs.close()
     return result
 
 

@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-ACTIVATIONS: dict[str, type[nn.Module]] = {"elu": nn.ELU, "silu": nn.SiLU, "relu": nn.ReLU}
+# ELU and ReLU know their gradient from their output, so they need no second tensor.
+ACTIVATIONS: dict[str, Callable[[], nn.Module]] = {
+    "elu": partial(nn.ELU, inplace=True),
+    "silu": nn.SiLU,
+    "relu": partial(nn.ReLU, inplace=True),
+}
 """ELU is the published one; on a CPU SiLU, as smooth, costs less than half of it."""
 
 

@@ -1,8 +1,8 @@
 """Draw learning curves from run folders.
 
     rpg-plot runs/maze
-    rpg-plot 'runs/rpg_*' 'runs/mbsac_*' --metric eval/success --out success.png
-    rpg-plot runs --group agent,exploration.scale
+    rpg-plot 'runs/rpg_*' 'runs/mbsac_*' --metric eval/stochastic/success_end --out success.png
+    rpg-plot runs --group agent,exploration.coefficient
 
 Writes a picture, against environment steps and against wall-clock time, and beside it a CSV with the same
 curves: interquartile mean over the seeds of a group and its 95 % stratified bootstrap interval.

@@ -45,13 +45,22 @@ def assemble(cfg: DictConfig) -> tuple[Trainer, Progress]:
         require_same_run(checkpoint, run)
     trainer = build_trainer(run)
     write_atomic(Path(run.run_dir) / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(run.plain)).encode())
-    write_atomic(Path(run.run_dir) / "run.json", json.dumps(provenance(), indent=2).encode())
+    _note_origin(Path(run.run_dir) / "run.json", resumes)
     progress = Progress(run.trainer.steps, label=f"{run.agent_name} {run.env.name} seed {run.seed}")
     if resumes:
         restored = trainer.resume()
         how = "" if restored else "; the simulator has no state to restore: new episodes from recorded seeds"
         progress.note(f"resumed {run.run_dir} at env step {trainer.env_steps}{how}")
     return trainer, progress
+
+
+def _note_origin(path: Path, resumes: bool) -> None:
+    """Record what started the run; each resumption adds itself to ``resumed``."""
+    origin = provenance()
+    if resumes and path.exists():
+        first = json.loads(path.read_text())
+        origin = first | {"resumed": [*first.get("resumed", []), origin]}
+    write_atomic(path, json.dumps(origin, indent=2).encode())
 
 
 def train(cfg: DictConfig) -> dict[str, Any]:

@@ -36,7 +36,9 @@ class LatentPrior:
         self._fixed = space.prior_params(1).to(device)
         self._entropy_weight = config.prior.entropy_weight
         if self.learned:
-            self._net: nn.Sequential = mlp(state_dim, config.width, space.policy_dim).to(device)
+            self._net: nn.Sequential = mlp(
+                state_dim, config.width, space.policy_dim, config.world_model.activation
+            ).to(device)
             # Starts exactly at the fixed prior.
             nn.init.zeros_(self._net[-1].weight)  # type: ignore[arg-type]
             self._optimizer = torch.optim.Adam(self._net.parameters(), config.prior.lr, fused=True)

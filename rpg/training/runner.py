@@ -6,12 +6,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from gymnasium.vector import VectorEnv
+from gymnasium.vector import AutoresetMode, VectorEnv
 from torch import Tensor
 
 from rpg.agents.agent import Agent
 from rpg.envs.base import Restorable
-from rpg.errors import NonFiniteError
+from rpg.errors import NonFiniteError, RPGError
 
 
 class Transition(NamedTuple):
@@ -50,6 +50,12 @@ class Runner:
 
     def __init__(self, agent: Agent, envs: VectorEnv[Any, Any, Any], seed: int, name: str = "env") -> None:
         self._agent, self._envs, self._seed, self._name = agent, envs, seed, name
+        mode = envs.metadata.get("autoreset_mode")
+        if mode is not None and mode != AutoresetMode.DISABLED:
+            raise RPGError(
+                f"{name}: autoreset mode {mode}; make the environments with "
+                'vector_kwargs={"autoreset_mode": AutoresetMode.DISABLED}'
+            )
         n = envs.num_envs
         self.num_envs = n
         self._obs = np.zeros((n, agent.obs_dim), dtype=np.float32)

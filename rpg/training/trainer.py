@@ -180,11 +180,15 @@ class Trainer:
         if self.exploration is not None and self.exploration.ready:
             self._add(self.exploration.update())
         if self.decisions > self.config.seed_decisions:
-            batch = self._replay.sample(self.agent.batch_size, self.agent.horizon)
-            if self.exploration is not None:
-                batch = self.exploration.relabel(batch)
-            self._add(self.agent.update(batch, self.env_steps))
-            self.updates += 1
+            self.update_agent()
+
+    def update_agent(self) -> None:
+        """Sample segments, judge their novelty as it is now, and let the agent learn from them."""
+        batch = self._replay.sample(self.agent.batch_size, self.agent.horizon)
+        if self.exploration is not None:
+            batch = self.exploration.relabel(batch)
+        self._add(self.agent.update(batch, self.env_steps))
+        self.updates += 1
 
     def _add(self, metrics: dict[str, Tensor]) -> None:
         # Sums stay on the device; they are read once per log row.
