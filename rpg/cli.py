@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 import sys
 from collections.abc import Iterator
@@ -68,17 +69,41 @@ def check_overrides(args: list[str]) -> None:
         p.relative_to(_CONF).as_posix() for p in _CONF.rglob("*") if p.is_dir() and p.name != "__pycache__"
     }
     chosen = [o for o in overrides if o.key_or_group in groups]
-    for override in chosen:
-        options = [p.stem for p in (_CONF / override.key_or_group).glob("*.yaml")]
-        for value in _values(override):
-            if str(value) not in options:
-                raise RPGError(f"{override.key_or_group}={value}: unknown; {nearest(str(value), options)}")
+    _check_options(chosen)
+    sweeps = [text for override, text in zip(overrides, texts, strict=True) if override.is_sweep_override()]
+    if sweeps and not {"-m", "--multirun"} & set(args):
+        raise RPGError(f"{sweeps[0]}: several values make a sweep; add -m, or quote a list as [a,b]")
     base = _compose([f"{o.key_or_group}={_values(o)[0]}" for o in chosen])
     for override in overrides:
         if override.key_or_group in groups or override.key_or_group.split(".")[0] == "hydra":
             continue
         if not (override.is_add() or override.is_force_add()):
             _require_key(base, override.key_or_group, groups)
+    single = [
+        text for override, text in zip(overrides, texts, strict=True) if not override.is_sweep_override()
+    ]
+    removed = [a for a in args if a.startswith("~")]
+    cfg = _compose([*single, *removed])
+    folder = OmegaConf.to_container(cfg, resolve=False)["run_dir"]  # type: ignore[call-overload,index]
+    _require_folder(Path("runs" if folder is None or "${" in str(folder) else str(folder)))
+
+
+def _check_options(chosen: list[Override]) -> None:
+    """Refuse options that a config group does not have."""
+    for override in chosen:
+        options = [p.stem for p in (_CONF / override.key_or_group).glob("*.yaml")]
+        for value in _values(override):
+            if str(value) not in options:
+                raise RPGError(f"{override.key_or_group}={value}: unknown; {nearest(str(value), options)}")
+
+
+def _require_folder(path: Path) -> None:
+    """Hydra makes the run folder before any code of ours runs, and would fail with a traceback."""
+    existing = next(p for p in (path.absolute(), *path.absolute().parents) if p.exists())
+    if not existing.is_dir() or not os.access(existing, os.W_OK | os.X_OK):
+        raise RPGError(
+            f"run_dir={path}: cannot be made, {existing} is not a writable folder; choose another run_dir"
+        )
 
 
 def _values(override: Override) -> list[Any]:
@@ -92,7 +117,7 @@ def _compose(overrides: list[str]) -> DictConfig:
     try:
         with initialize_config_module("rpg.conf", version_base="1.3"):
             return compose("config", overrides=overrides)
-    except (HydraException, OmegaConfBaseException) as error:
+    except (HydraException, OmegaConfBaseException, ValueError) as error:
         raise RPGError(f"config: {str(error).strip().splitlines()[0]}") from error
 
 

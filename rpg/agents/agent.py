@@ -126,6 +126,6 @@ class Agent:
 
 
 def _brief(space: gym.Space[Any]) -> str:
-    """The space in one line, without the entries of its bounds."""
-    shape = f" of shape {space.shape}" if space.shape else ""
-    return f"{type(space).__name__}{shape}"
+    """The space in one short line, however many entries its bounds have."""
+    text = " ".join(str(space).split())
+    return text if len(text) <= 80 else f"{text[:60]}... of shape {space.shape}"

@@ -31,6 +31,12 @@ def parse_config(cfg: DictConfig) -> RunConfig:
         RPGError: an unknown key, a wrong type or an impossible value, in one line.
     """
     plain = _plain(cfg)
+    for section in ("agent", "world_model", "exploration", "env", "trainer", "logger"):
+        if not isinstance(plain.get(section), dict):
+            raise RPGError(f"config: section '{section}' is {plain.get(section)!r}, but a run needs it")
+    for key in ("device", "run_dir"):
+        if not isinstance(plain.get(key), str):
+            raise RPGError(f"{key}={plain.get(key)!r}: must be a text")
     agent = dict(plain["agent"])
     name = agent.pop("name", None)
     if name not in (*LEARNERS, *SCRIPTED):
@@ -41,11 +47,11 @@ def parse_config(cfg: DictConfig) -> RunConfig:
     exploration_name = exploration.pop("name", None)
     if exploration_name not in ("rnd", "none"):
         raise RPGError(f"exploration.name={exploration_name!r}: choose rnd or none")
-    threads = plain["threads"]
+    threads = plain.get("threads")
     if threads is not None and (not isinstance(threads, int) or threads < 1):
         raise RPGError(f"threads={threads!r}: a whole number of at least 1, or null")
-    if not isinstance(plain["seed"], int) or plain["seed"] < 0:
-        raise RPGError(f"seed={plain['seed']!r}: must be a whole number, not negative")
+    if not isinstance(plain.get("seed"), int) or plain["seed"] < 0:
+        raise RPGError(f"seed={plain.get('seed')!r}: must be a whole number, not negative")
     return RunConfig(
         agent_name=name,
         agent=_section(RPGConfig, {**agent, **model}, "agent") if learner else RPGConfig(),
