@@ -51,8 +51,8 @@ VARIANTS = {
         "rpg", "categorical12", ("agent.latent.gaussian=0", "agent.latent.categories=12"), seeds=(0,)
     ),
     # What made the difference: one published choice put back at a time, then all of them.
-    "white-noise": Variant("rpg", "gaussian12", ("agent.noise_correlation=0",), steps=40_000, seeds=(0,)),
-    "low-entropy": Variant("rpg", "gaussian12", ("agent.entropy_target=-2",), steps=40_000, seeds=(0,)),
+    "white-noise": Variant("rpg", "gaussian12", ("agent.noise_correlation=0",), steps=20_000, seeds=(0,)),
+    "low-entropy": Variant("rpg", "gaussian12", ("agent.entropy_target=-2",), steps=20_000, seeds=(0,)),
     "small-bonus": Variant(
         "rpg",
         "gaussian12",
@@ -61,9 +61,9 @@ VARIANTS = {
         seeds=(0,),
     ),
     "slow-target": Variant(
-        "rpg", "gaussian12", ("size.target_rate=0.005", "size.target_every=2"), steps=40_000, seeds=(0,)
+        "rpg", "gaussian12", ("size.target_rate=0.005", "size.target_every=2"), steps=20_000, seeds=(0,)
     ),
-    "published-tuning": Variant("rpg", "gaussian12", _PUBLISHED, steps=40_000, seeds=(0,)),
+    "published-tuning": Variant("rpg", "gaussian12", _PUBLISHED, steps=20_000, seeds=(0,)),
     # What the smaller batch and width cost.
     "paper-size": Variant(
         "rpg", "gaussian12", ("size.target_rate=0.03", "size.target_every=1"), "paper", 10_000, (0,)
