@@ -57,7 +57,7 @@ VARIANTS = {
         "rpg",
         "gaussian12",
         ("exploration.coefficient=0.1", "exploration.forgetting=0"),
-        steps=40_000,
+        steps=20_000,
         seeds=(0,),
     ),
     "slow-target": Variant(
