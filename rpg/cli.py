@@ -20,6 +20,16 @@ from omegaconf.errors import OmegaConfBaseException
 from rpg.errors import RPGError, nearest
 
 _CONF = Path(__file__).parent / "conf"
+_NOT_IN_FOLDER = (
+    "agent",
+    "env",
+    "seed",
+    "device",
+    "threads",
+    "logger",
+    "trainer.steps",
+    "trainer.checkpoint_every",
+)
 
 
 @contextmanager
@@ -84,6 +94,9 @@ def check_overrides(args: list[str]) -> None:
     ]
     removed = [a for a in args if a.startswith("~")]
     cfg = _compose([*single, *removed])
+    named = ",".join(text for text in texts if text.split("=")[0] not in _NOT_IN_FOLDER)
+    if len(named) > 200 and not any(text.startswith("run_dir=") for text in texts):
+        raise RPGError("too many overrides to name the run folder after them; add run_dir=runs/my_run")
     folder = OmegaConf.to_container(cfg, resolve=False)["run_dir"]  # type: ignore[call-overload,index]
     _require_folder(Path("runs" if folder is None or "${" in str(folder) else str(folder)))
 

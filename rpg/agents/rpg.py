@@ -239,7 +239,7 @@ class RPG(Agent):
             metrics = {"loss/posterior": -log_p.detach(), "train/beta": self.beta}
             if cfg.tune_beta:
                 loss = loss + self._log_beta * (log_p.detach() - cfg.consistency_target)
-        if cfg.tune_alpha:
+        if cfg.tune_alpha and cfg.alpha > 0:
             target = -float(self.action_dim) if cfg.entropy_target is None else cfg.entropy_target
             # alpha rises while the entropy is below its target.
             loss = loss - self._log_alpha * (imagined.log_pi.detach().mean() + target)

@@ -24,6 +24,8 @@ from rpg.training.runner import Episode, Runner, evaluate, summarize
 
 Row = dict[str, float | int | str]
 
+_EVALUATION_SEED = 1_000_000  # added to the run's seed, so that evaluation does not replay training episodes
+
 
 class Trainer:
     """Trains one agent in one batch of environments, resumably.
@@ -239,7 +241,7 @@ class Trainer:
                 self.agent,
                 self._eval_envs,
                 self.config.eval_episodes,
-                self._seed,
+                self._seed + _EVALUATION_SEED,
                 deterministic,
                 self._env_name,
             )

@@ -266,6 +266,17 @@ def test_z_is_drawn_where_an_episode_begins_and_kept_elsewhere() -> None:
     assert (new[mask] != old[mask]).all()
 
 
+def test_policy_learns_with_the_z_that_acted_and_with_fresh_ones_at_first_steps() -> None:
+    def value(step: float, z: float) -> float:
+        agent = make()
+        batch = next(batches(agent, 1))._replace(step=torch.full((8,), step), latent=torch.full((8, 2), z))
+        torch.manual_seed(3)
+        return float(agent._update_policy(batch)["train/policy_value"])
+
+    assert value(step=0.0, z=1.0) == value(step=0.0, z=-1.0)
+    assert value(step=1.0, z=1.0) != value(step=1.0, z=-1.0)
+
+
 def preferring(
     space: Any, wanted: int, prior: LatentPrior
 ) -> Callable[[Tensor], tuple[Tensor, Tensor, Tensor]]:

@@ -34,7 +34,7 @@ SHORT = (
     "trainer.decisions_per_update=10",
     "trainer.picture_every=0",
 )
-REAL = (*SHORT, "trainer.steps=900", "trainer.eval_every=450")
+REAL = (*SHORT, "trainer.steps=1200", "trainer.eval_every=600")
 LEARNED_PRIOR = ("agent.latent.gaussian=0", "agent.latent.categories=3", "agent.prior.mode=policy_gradient")
 
 
@@ -216,7 +216,7 @@ def test_the_command_survives_kills_and_signals_at_any_moment(
     run = tmp_path / "run"
     rng = np.random.default_rng()
     ends = (signal.SIGKILL, signal.SIGTERM, signal.SIGKILL, signal.SIGINT, signal.SIGKILL)
-    for end, count in zip(ends, (1, 5, 8, 11, 14), strict=True):
+    for end, count in zip(ends, (1, 4, 7, 10, 13), strict=True):
         process = command("rpg.train", f"run_dir={run}", "device=cpu", "logger=files", *REAL)
         wait_for_rows(process, run, count)
         time.sleep(rng.uniform(0, 0.1))
@@ -230,5 +230,5 @@ def test_the_command_survives_kills_and_signals_at_any_moment(
         assert "resume with" in out
         assert f"run_dir={run}" in out
         assert "Traceback" not in err
-    assert train(composed(*REAL))["env_steps"] == 900
+    assert train(composed(*REAL))["env_steps"] == 1200
     assert_equal_runs(run, straight_real)

@@ -14,7 +14,7 @@ from torch import Tensor
 from rpg.agents import Agent
 from rpg.envs.config import EnvConfig
 from rpg.envs.make import make_envs
-from rpg.errors import NonFiniteError
+from rpg.errors import NonFiniteError, RPGError
 from rpg.training.runner import Episode, Runner, evaluate, summarize
 
 
@@ -148,6 +148,12 @@ def test_summary_is_the_mean_of_every_column() -> None:
         "eval/success_ever": 1.0,
     }
     assert summarize([], "eval") == {}
+
+
+def test_environments_that_reset_themselves_are_refused() -> None:
+    envs = SyncVectorEnv([lambda: Clock(3)], autoreset_mode=AutoresetMode.NEXT_STEP)
+    with pytest.raises(RPGError, match="clock: autoreset mode"):
+        Runner(still(envs), envs, 0, "clock")
 
 
 # -- seeds ---------------------------------------------------------------------------------------------
