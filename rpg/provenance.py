@@ -36,7 +36,9 @@ def commit() -> str:
         ).stdout.strip()
         # Results are written while experiments run; only a change of code makes a checkout dirty.
         changed = subprocess.run(
-            ["git", "diff", "--quiet", "HEAD", "--", "rpg", "scripts", "benchmarks"], cwd=root, check=False
+            ["git", "diff", "--quiet", "HEAD", "--", "rpg", "scripts", "benchmarks/*.py"],
+            cwd=root,
+            check=False,
         ).returncode
     except (OSError, subprocess.CalledProcessError):
         return f"v{__version__}"
