@@ -94,7 +94,12 @@ def check_overrides(args: list[str]) -> None:
     ]
     removed = [a for a in args if a.startswith("~")]
     cfg = _compose([*single, *removed])
-    named = ",".join(text for text in texts if text.split("=")[0] not in _NOT_IN_FOLDER)
+    # Hydra names the folder after the overrides of our keys, not after its own.
+    named = ",".join(
+        text
+        for text in texts
+        if text.split("=")[0] not in _NOT_IN_FOLDER and not text.startswith("hydra.")
+    )
     if len(named) > 200 and not any(text.startswith("run_dir=") for text in texts):
         raise RPGError("too many overrides to name the run folder after them; add run_dir=runs/my_run")
     folder = OmegaConf.to_container(cfg, resolve=False)["run_dir"]  # type: ignore[call-overload,index]

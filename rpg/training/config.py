@@ -18,7 +18,8 @@ class TrainerConfig:
     Args:
         steps: env steps to train for.
         seed_decisions: decisions taken before the first agent update (1000 in Table 3.1).
-        decisions_per_update: decisions per gradient update (5 in Table 3.1); 0 never learns.
+        decisions_per_update: decisions per gradient update (5 in Table 3.1); below 1 several updates to a
+            decision; 0 never learns.
         replay_capacity: transitions kept.
         log_every: between log rows.
         eval_every: between evaluations; 0 never.
@@ -30,7 +31,7 @@ class TrainerConfig:
 
     steps: int = 240_000
     seed_decisions: int = 1000
-    decisions_per_update: int = 5
+    decisions_per_update: float = 5
     replay_capacity: int = 800_000
     log_every: int = 1000
     eval_every: int = 20_000

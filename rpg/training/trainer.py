@@ -175,7 +175,7 @@ class Trainer:
     def _ticks_due(self) -> int:
         if not self.config.decisions_per_update or not self.agent.batch_size:
             return 0
-        return self.decisions // self.config.decisions_per_update
+        return int(self.decisions / self.config.decisions_per_update + 1e-9)
 
     def learn_once(self) -> None:
         """One update of the exploration bonus and, once enough is stored, of the agent."""

@@ -15,6 +15,7 @@ class WorldModelConfig:
     Args:
         state_dim: width of the latent state s.
         width: hidden width of every MLP and of the GRU.
+        dynamics: ``gru`` (published) or ``residual``, s' = s + f(s, a), which is a quarter of the work.
         activation: of every MLP, policy and posterior included: ``elu`` (published), ``silu`` or ``relu``.
         critic: ``v`` composes Q(s, a, z) = r(s', a) + gamma V(s', z) as the published code does;
             ``q`` learns Q(s, a, z) directly as in Eq. 3.3.
@@ -31,6 +32,7 @@ class WorldModelConfig:
 
     state_dim: int = 100
     width: int = 256
+    dynamics: str = "gru"
     activation: str = "elu"
     critic: str = "v"
     horizon: int = 3
@@ -45,6 +47,8 @@ class WorldModelConfig:
     def __post_init__(self) -> None:
         if self.critic not in ("v", "q"):
             raise RPGError(f"world_model.critic={self.critic!r}: choose 'v' or 'q'")
+        if self.dynamics not in ("gru", "residual"):
+            raise RPGError(f"world_model.dynamics={self.dynamics!r}: choose 'gru' or 'residual'")
         if self.activation not in ACTIVATIONS:
             raise RPGError(f"world_model.activation={self.activation!r}: choose {', '.join(ACTIVATIONS)}")
         for name in ("state_dim", "width", "horizon", "target_every"):

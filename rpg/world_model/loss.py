@@ -42,7 +42,7 @@ def model_losses(
         target_values: (K, N), regression target of the critic at each step: of V(s_{t+1}, z) for critic
             ``v``, of Q(s_t, a_t, z) for critic ``q``.
     """
-    embedded = model.action_encoder(actions)
+    embedded = model.dynamics.embed(actions)
     first = model.encoder(inputs)
     states = model.unroll(first, embedded)  # (K, N, state_dim)
     latents = latent.expand(actions.shape[0], *latent.shape)

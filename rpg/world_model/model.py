@@ -7,13 +7,13 @@ from torch import Tensor, nn
 
 from rpg.networks import TwinMLP, mlp
 from rpg.world_model.config import WorldModelConfig
+from rpg.world_model.dynamics import DYNAMICS
 
 
 class WorldModel(nn.Module):
     """s = f(o), s' = h(s, a), r = R(s', a) and twin values.
 
-    The dynamics are a GRU that carries its own hidden state from the first encoded state of a rollout
-    and reads out a latent state at each step; the reward head looks at the state *reached*.
+    The reward head looks at the state *reached*.
 
     Args:
         input_dim: width of the (already scaled and encoded) observation.
@@ -27,12 +27,10 @@ class WorldModel(nn.Module):
         state, width, act = config.state_dim, config.width, config.activation
         self.critic = config.critic
         self.encoder = mlp(input_dim, width, state, act)
-        self.action_encoder = mlp(action_dim, width, width, act)
-        self.start = mlp(state, width, width, act)
-        self.gru = nn.GRUCell(width, width)
-        self.readout = mlp(width, width, state, act)
-        self.reward_head = mlp(state + width, width, 1, act)
-        critic_dim = state + latent_dim + (width if config.critic == "q" else 0)
+        self.dynamics = DYNAMICS[config.dynamics](action_dim, config)
+        embedded = self.dynamics.embedded_dim
+        self.reward_head = mlp(state + embedded, width, 1, act)
+        critic_dim = state + latent_dim + (embedded if config.critic == "q" else 0)
         self.value_heads = TwinMLP(critic_dim, width, act)
 
     def unroll(self, state: Tensor, embedded_actions: Tensor) -> Tensor:
@@ -40,18 +38,17 @@ class WorldModel(nn.Module):
 
         Args:
             state: (N, state_dim), the encoded first state.
-            embedded_actions: (H, N, width) from :attr:`action_encoder`.
+            embedded_actions: (H, N, embedded_dim) from the dynamics' ``embed``.
 
         Returns:
             (H, N, state_dim).
         """
-        hidden = self.start(state)
+        hidden = self.dynamics.start(state)
         hiddens = []
         for embedded in embedded_actions:
-            hidden = self.gru(embedded, hidden)
+            hidden = self.dynamics.step(hidden, embedded)
             hiddens.append(hidden)
-        states: Tensor = self.readout(torch.stack(hiddens))
-        return states
+        return self.dynamics.readout(torch.stack(hiddens))
 
     def reward(self, next_state: Tensor, embedded_action: Tensor) -> Tensor:
         """Predicted reward (...) of reaching ``next_state`` by an action."""

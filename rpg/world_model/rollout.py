@@ -45,12 +45,13 @@ def imagine(
         alpha: weight of the entropy of the bootstrap's own action (critic ``q`` only); None leaves it out.
     """
     states, actions, log_pis, embeddeds = [state], [], [], []
-    hidden = model.start(state)
+    dynamics = model.dynamics
+    hidden = dynamics.start(state)
     for _ in range(horizon):
         action, log_pi = policy(states[-1], latent).rsample()
-        embedded = model.action_encoder(action)
-        hidden = model.gru(embedded, hidden)
-        states.append(model.readout(hidden))
+        embedded = dynamics.embed(action)
+        hidden = dynamics.step(hidden, embedded)
+        states.append(dynamics.readout(hidden))
         actions.append(action)
         log_pis.append(log_pi)
         embeddeds.append(embedded)
@@ -61,7 +62,7 @@ def imagine(
         bootstrap = model.value(reached, latents)
     else:
         action, log_pi = policy(reached, latents).rsample()
-        bootstrap = model.q_value(reached, model.action_encoder(action), latents)
+        bootstrap = model.q_value(reached, dynamics.embed(action), latents)
         if alpha is not None:
             bootstrap = bootstrap - alpha * log_pi
     rewards = model.reward(reached, torch.stack(embeddeds))
