@@ -25,6 +25,7 @@ _NOT_IN_FOLDER = (
     "env",
     "seed",
     "device",
+    "compile",
     "threads",
     "logger",
     "trainer.steps",
@@ -96,9 +97,7 @@ def check_overrides(args: list[str]) -> None:
     cfg = _compose([*single, *removed])
     # Hydra names the folder after the overrides of our keys, not after its own.
     named = ",".join(
-        text
-        for text in texts
-        if text.split("=")[0] not in _NOT_IN_FOLDER and not text.startswith("hydra.")
+        text for text in texts if text.split("=")[0] not in _NOT_IN_FOLDER and not text.startswith("hydra.")
     )
     if len(named) > 200 and not any(text.startswith("run_dir=") for text in texts):
         raise RPGError("too many overrides to name the run folder after them; add run_dir=runs/my_run")

@@ -88,6 +88,9 @@ class Agent:
         """
         return {}
 
+    def compile(self) -> None:
+        """Compile what is worth it; called once, before the first update. Results stay the same."""
+
     def state_dict(self) -> dict[str, Any]:
         """Everything learned, as tensors and plain data."""
         return {}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium as gym
@@ -13,12 +14,35 @@ from torch import Tensor, nn
 from rpg.agents.agent import Agent, Metrics
 from rpg.agents.config import RPGConfig
 from rpg.agents.prior import LatentPrior
+from rpg.compiling import compile_region, keep_address
 from rpg.exploration.objects import ObjectsOfInterest
+from rpg.flat import FlatAdam, FlatParameters
 from rpg.policies import LatentPolicy, LatentPosterior, make_latent_space
 from rpg.segments import SegmentBatch
 from rpg.world_model import ObservationInput, WorldModel
-from rpg.world_model.loss import model_losses, total_loss
+from rpg.world_model.loss import ModelLosses, model_losses, total_loss
 from rpg.world_model.rollout import Imagined, horizon_weights, imagine, shaped_reward, value_estimate
+
+
+class _Auxiliary(nn.Module):
+    """p_phi(z|s, a) and the logarithms of alpha's and beta's tuned factors."""
+
+    def __init__(self, posterior: LatentPosterior | None) -> None:
+        super().__init__()
+        self.posterior = posterior
+        self.log_alpha = nn.Parameter(torch.zeros(()))
+        self.log_beta = nn.Parameter(torch.zeros(()))
+
+
+class _Networks(nn.Module):
+    """Everything learned, so that a function of it can be run with parameters from the flat vectors."""
+
+    def __init__(self, model: WorldModel, target: WorldModel, policy: LatentPolicy, aux: _Auxiliary) -> None:
+        super().__init__()
+        self.model, self.target, self.policy, self.aux = model, target, policy, aux
+
+    def forward(self, function: Callable[..., Any], *args: Any) -> Any:
+        return function(*args)
 
 
 class RPG(Agent):
@@ -55,40 +79,42 @@ class RPG(Agent):
             if self.latent_dim
             else None
         )
-        for net in (self.model, self.policy, self.posterior):
-            if net is not None:
-                net.to(self.device)
-        self.target = copy.deepcopy(self.model).requires_grad_(False)
+        self._aux = _Auxiliary(self.posterior)
+        for net in (self._input, self.model, self.policy, self._aux):
+            net.to(self.device)
+        self.target = copy.deepcopy(self.model)
         self.prior = LatentPrior(self.space, state_dim, self.obs_dim, cfg, self.device)
-        self._log_alpha = nn.Parameter(torch.zeros((), device=self.device))
-        self._log_beta = nn.Parameter(torch.zeros((), device=self.device))
         self._noise = torch.zeros(0, self.action_dim, device=self.device)
         self._updates = 0
         self._actor_weights = horizon_weights(cfg.actor_horizon, cfg.horizon_decay)
         self._target_weights = horizon_weights(cfg.target_horizon, cfg.horizon_decay)
-        self._make_optimizers()
-
-    def _make_optimizers(self) -> None:
-        self._model_params: list[Tensor] = list(self.model.parameters())
-        self._target_params: list[Tensor] = list(self.target.parameters())
-        self._policy_params: list[Tensor] = list(self.policy.parameters())
+        self._nets = _Networks(self.model, self.target, self.policy, self._aux)
+        self._model_optimizer = FlatAdam(self.model, cfg.world_model.lr, cfg.world_model.grad_clip)
+        self._target_vector = FlatParameters(self.target)
+        self._policy_optimizer = FlatAdam(self.policy, cfg.lr, cfg.grad_clip)
         # Posterior and coefficients share an optimiser: none of them is clipped, and one step serves all.
-        self._aux_params: list[Tensor] = [self._log_alpha, self._log_beta]
-        if self.posterior is not None:
-            self._aux_params += list(self.posterior.parameters())
-        self._model_optimizer = torch.optim.Adam(self._model_params, self.config.world_model.lr, fused=True)
-        self._policy_optimizer = torch.optim.Adam(self._policy_params, self.config.lr, fused=True)
-        self._aux_optimizer = torch.optim.Adam(self._aux_params, self.config.lr, fused=True)
+        self._aux_optimizer = FlatAdam(self._aux, cfg.lr)
+        self._model_region, self._policy_region = self._learn_model, self._learn_policy
+        self._act_region = self._act
+
+    def compile(self) -> None:
+        """Compile the learning step and acting; results are those of the plain functions up to rounding."""
+        for flat in (self._model_optimizer, self._policy_optimizer, self._aux_optimizer):
+            keep_address(flat.vector, flat.mean, flat.square, flat.count)
+        keep_address(self._target_vector.vector)
+        self._model_region = compile_region(self._learn_model, "world model", self.device)
+        self._policy_region = compile_region(self._learn_policy, "policy", self.device)
+        self._act_region = compile_region(self._act, "act", self.device)
 
     @property
     def alpha(self) -> Tensor:
         """Entropy weight: the initial value times exp of a tuned exponent."""
-        return self.config.alpha * self._log_alpha.detach().exp()
+        return self.config.alpha * self._aux.log_alpha.detach().exp()
 
     @property
     def beta(self) -> Tensor:
         """Consistency weight."""
-        return self.config.beta * self._log_beta.detach().exp()
+        return self.config.beta * self._aux.log_beta.detach().exp()
 
     # -- acting ----------------------------------------------------------------------------------------
 
@@ -107,23 +133,29 @@ class RPG(Agent):
     @torch.no_grad()
     def sample_latent(self, obs: Tensor) -> Tensor:
         """Draw z ~ pi(z|s1)."""
-        state = self.model.encoder(self._input(obs)) if self.prior.learned else None
+        state = self.model.encode(self._input(obs)) if self.prior.learned else None
         return self.prior.sample(len(obs), state)
 
     @torch.no_grad()
     def act(self, obs: Tensor, latent: Tensor, deterministic: bool = False) -> Tensor:
         """Draw a ~ pi(a|s, z), or take the mode of pi(.|s, z)."""
-        distribution = self.policy(self.model.encoder(self._input(obs)), latent)
         if deterministic:
-            return self.to_env(distribution.mode)
-        return self.to_env(distribution.rsample(self._next_noise(len(obs)))[0])
+            return self.to_env(self.policy(self.model.encode(self._input(obs)), latent).mode)
+        # Evaluation has batches of another shape, for which nothing was compiled.
+        act = self._act if self._evaluating else self._act_region
+        return act(obs, latent, self._next_noise(len(obs)))
 
-    def _next_noise(self, n: int) -> Tensor | None:
-        """The next value of a stationary AR(1) process, or None for independent noise."""
+    @torch.no_grad()
+    def _act(self, obs: Tensor, latent: Tensor, noise: Tensor) -> Tensor:
+        distribution = self.policy(self.model.encode(self._input(obs)), latent)
+        return self.to_env(distribution.rsample(noise)[0])
+
+    def _next_noise(self, n: int) -> Tensor:
+        """The next value of a stationary AR(1) process, of independent noise if its correlation is 0."""
         rho = self.config.noise_correlation
-        if not rho:
-            return None
         fresh = torch.randn(n, self.action_dim, device=self.device)
+        if not rho:
+            return fresh
         # Without begin_episodes there is nothing to be correlated with.
         self._noise = fresh if len(self._noise) != n else rho * self._noise + math.sqrt(1 - rho**2) * fresh
         return self._noise
@@ -139,124 +171,176 @@ class RPG(Agent):
     # -- learning --------------------------------------------------------------------------------------
 
     def update(self, batch: SegmentBatch, env_steps: int = 0) -> Metrics:
-        """One pass of Algorithm 1's loop body. No scalar leaves the device here."""
-        autocast = self.config.precision == "bfloat16"
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=autocast):
-            metrics = self._update_model(batch, env_steps)
-            if self._updates % self.config.actor_every == 0:
-                metrics |= self._update_policy(batch)
-            if self.prior.learned and self._updates % self.config.prior.every == 0:
-                metrics |= self.prior.update(self._value_of_starts, env_steps)
-        if self._updates % self.config.world_model.target_every == 0:
-            with torch.no_grad():
-                torch._foreach_lerp_(
-                    self._target_params, self._model_params, self.config.world_model.target_rate
-                )
-        self._updates += 1
-        return metrics
+        """One pass of Algorithm 1's loop body. No scalar leaves the device here.
 
-    def _update_model(self, batch: SegmentBatch, env_steps: int) -> Metrics:
-        """Eq. 3.4."""
+        Random numbers are drawn here and handed to two regions of fixed shape, each a function of tensors
+        that may be compiled: the world model's step and the policy's.
+        """
         cfg = self.config
         reward = batch.reward * (cfg.reward_scale * cfg.reward_ramp.factor_at(env_steps))
         if batch.bonus is not None:
             reward = reward + batch.bonus
-        target_states, target_values = self._targets(batch, reward)
-        losses = model_losses(
-            self.model,
-            self._input(batch.obs),
-            self.from_env(batch.action),
-            reward,
-            batch.latent,
-            batch.mask,
-            target_states,
-            target_values,
-        )
-        grads = torch.autograd.grad(total_loss(losses, cfg.world_model), self._model_params)
-        norm = _step(self._model_optimizer, self._model_params, grads, cfg.world_model.grad_clip)
+        metrics = self._model_region(batch, reward, self._draw(cfg.target_horizon, reward.numel()))
+        if self._updates % cfg.actor_every == 0:
+            n = len(batch.obs)
+            fresh = self.prior.sample(n, self._encoded(batch.obs) if self.prior.learned else None)
+            metrics = metrics | self._policy_region(batch, fresh, self._draw(cfg.actor_horizon, n))
+        if self.prior.learned and self._updates % cfg.prior.every == 0:
+            with self._autocast():
+                metrics = metrics | self.prior.update(self._value_of_starts, env_steps)
+        if self._updates % cfg.world_model.target_every == 0:
+            with torch.no_grad():
+                self._target_vector.vector.lerp_(self._model_optimizer.vector, cfg.world_model.target_rate)
+        self._updates += 1
+        return metrics
+
+    def _draw(self, horizon: int, n: int) -> Tensor:
+        """Standard normal noise for the actions of ``n`` imagined rollouts, and for their bootstraps' own."""
+        kinds = 2 if self.model.critic == "q" else 1
+        return torch.randn(kinds, horizon, n, self.action_dim, device=self.device)
+
+    def _autocast(self) -> torch.autocast:
+        return torch.autocast(self.device.type, torch.bfloat16, enabled=self.config.precision == "bfloat16")
+
+    def _run(self, function: Callable[..., Any], *args: Any) -> Any:
+        """Call ``function`` with every network's parameters cut from the flat vectors."""
+        views = {
+            **self._model_optimizer.views(self._model_optimizer.vector, "model."),
+            **self._target_vector.views(self._target_vector.vector, "target."),
+            **self._policy_optimizer.views(self._policy_optimizer.vector, "policy."),
+            **self._aux_optimizer.views(self._aux_optimizer.vector, "aux."),
+        }
+        return torch.func.functional_call(self._nets, views, (function, *args))
+
+    def _learn_model(self, batch: SegmentBatch, reward: Tensor, noise: Tensor) -> Metrics:
+        """Eq. 3.4: targets, losses, one step of Adam."""
+        optimizer = self._model_optimizer
+        losses, target_values = self._run(self._model_terms, batch, reward, noise)
+        (grad,) = torch.autograd.grad(total_loss(losses, self.config.world_model), [optimizer.vector])
+        norm = optimizer.step(grad)
         return {
             "loss/state": losses.state.detach(),
             "loss/reward": losses.reward.detach(),
             "loss/value": losses.value.detach(),
             "train/model_grad_norm": norm,
+            "train/model_clipped": (norm > self.config.world_model.grad_clip).float(),
             "train/value_target": target_values.mean(),
             "train/reward": reward.mean(),
         }
 
+    def _model_terms(self, batch: SegmentBatch, reward: Tensor, noise: Tensor) -> tuple[ModelLosses, Tensor]:
+        with self._autocast():
+            target_states, target_values = self._targets(batch, reward, noise)
+            losses = model_losses(
+                self.model,
+                self._input(batch.obs),
+                self.from_env(batch.action),
+                reward,
+                batch.latent,
+                batch.mask,
+                target_states,
+                target_values,
+            )
+        return losses, target_values
+
     @torch.no_grad()
-    def _targets(self, batch: SegmentBatch, reward: Tensor) -> tuple[Tensor, Tensor]:
+    def _targets(
+        self, batch: SegmentBatch, reward: Tensor, noise: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Latent states (K, N, state_dim) and critic targets (K, N) from the target model.
 
         The policy in the imagined rollout is the online one. A terminal state has value 0.
         """
         cfg = self.config
-        states: Tensor = self.target.encoder(self._input(batch.next_obs)).float()  # (K, N, state_dim)
+        states: Tensor = self.target.encode(self._input(batch.next_obs)).float()  # (K, N, state_dim)
         steps, n, _ = states.shape
         latent = batch.latent.expand(steps, n, -1).reshape(steps * n, -1)
         alpha = self.alpha if cfg.entropy_in_target else None
-        imagined = imagine(self.target, self.policy, states.flatten(0, 1), latent, cfg.target_horizon, alpha)
+        imagined = imagine(
+            self.target, self.policy, states.flatten(0, 1), latent, cfg.target_horizon, alpha, noise
+        )
         shaped = shaped_reward(imagined, latent, self.posterior, alpha, self.beta)
         estimate = value_estimate(shaped, imagined.bootstrap, cfg.gamma, self._target_weights)
         after = estimate.min(0).values.view(steps, n) * (1.0 - batch.terminated)
         return states, (after if self.model.critic == "v" else reward + cfg.gamma * after).float()
 
-    def _update_policy(self, batch: SegmentBatch) -> Metrics:
-        """Climb Eq. 3.3 in pi(a|s, z), fit the posterior, adapt alpha and beta."""
-        cfg = self.config
-        with torch.no_grad():
-            state = self.model.encoder(self._input(batch.obs))
-            # At the first step z is still free: draw it anew rather than repeat the stored ones.
-            fresh = self.prior.sample(len(state), state)
-            latent = torch.where((batch.step == 0).unsqueeze(1), fresh, batch.latent)
-        imagined = imagine(self.model, self.policy, state, latent, cfg.actor_horizon, self.alpha)
-        shaped = shaped_reward(imagined, latent, self.posterior, self.alpha, self.beta)
-        estimate = value_estimate(shaped, imagined.bootstrap, cfg.gamma, self._actor_weights)
-        value = {"first": estimate[0], "mean": estimate.mean(0), "min": estimate.min(0).values}[
-            cfg.actor_value
-        ]
+    def _learn_policy(self, batch: SegmentBatch, fresh: Tensor, noise: Tensor) -> Metrics:
+        """Climb Eq. 3.3 in pi(a|s, z), fit the posterior, adapt alpha and beta.
+
+        ``fresh`` (N, latent_dim) are newly drawn z: at an episode's first step z is still free.
+        """
+        cfg, optimizer = self.config, self._policy_optimizer
+        value, imagined, latent = self._run(self._policy_terms, batch, fresh, noise)
         # Gradients of the policy alone: what flows through model and posterior is not accumulated there.
-        grads = torch.autograd.grad(-value.mean(), self._policy_params)
-        norm = _step(self._policy_optimizer, self._policy_params, grads, cfg.grad_clip)
+        (grad,) = torch.autograd.grad(-value.mean(), [optimizer.vector])
+        norm = optimizer.step(grad)
         metrics = {
             "train/policy_value": value.detach().mean(),
             "train/policy_grad_norm": norm,
+            "train/policy_clipped": (norm > cfg.grad_clip).float(),
             "train/entropy": -imagined.log_pi.detach().mean(),
             "train/alpha": self.alpha,
         }
-        return metrics | self._update_posterior(imagined, latent)
+        return metrics | self._learn_auxiliary(imagined, latent)
 
-    def _update_posterior(self, imagined: Imagined, latent: Tensor) -> Metrics:
-        """Maximum likelihood for p_phi(z|s, a) on imagined steps, and the two coefficients."""
+    def _policy_terms(
+        self, batch: SegmentBatch, fresh: Tensor, noise: Tensor
+    ) -> tuple[Tensor, Imagined, Tensor]:
         cfg = self.config
+        with self._autocast():
+            state = self._encoded(batch.obs)
+            latent = torch.where((batch.step == 0).unsqueeze(1), fresh, batch.latent)
+            imagined = imagine(self.model, self.policy, state, latent, cfg.actor_horizon, self.alpha, noise)
+            shaped = shaped_reward(imagined, latent, self.posterior, self.alpha, self.beta)
+            estimate = value_estimate(shaped, imagined.bootstrap, cfg.gamma, self._actor_weights)
+        value = {"first": estimate[0], "mean": estimate.mean(0), "min": estimate.min(0).values}
+        return value[cfg.actor_value], imagined, latent
+
+    def _learn_auxiliary(self, imagined: Imagined, latent: Tensor) -> Metrics:
+        """Maximum likelihood for p_phi(z|s, a) on imagined steps, and the two coefficients."""
+        cfg, optimizer = self.config, self._aux_optimizer
         metrics: Metrics = {}
-        loss = self._log_alpha.new_zeros(())
+        terms = []
         if self.posterior is not None:
-            latents = latent.expand(imagined.actions.shape[0], *latent.shape)
-            log_p = self.posterior.log_prob(
-                imagined.states[:-1].detach(), imagined.actions.detach(), latents
-            ).mean()
-            loss = loss - log_p
+            log_p = self._run(self._log_posterior, imagined, latent)
+            terms.append(-log_p)
             metrics = {"loss/posterior": -log_p.detach(), "train/beta": self.beta}
             if cfg.tune_beta:
-                loss = loss + self._log_beta * (log_p.detach() - cfg.consistency_target)
-        if cfg.tune_alpha and cfg.alpha > 0:
+                gap = log_p.detach() - cfg.consistency_target
+                terms.append(optimizer.vector[optimizer.part("log_beta")].sum() * gap)
+        log_alpha = optimizer.part("log_alpha")
+        tune_alpha = cfg.tune_alpha and cfg.alpha > 0
+        if tune_alpha:
             target = -float(self.action_dim) if cfg.entropy_target is None else cfg.entropy_target
             # alpha rises while the entropy is below its target.
-            loss = loss - self._log_alpha * (imagined.log_pi.detach().mean() + target)
-        if loss.requires_grad:
-            grads = torch.autograd.grad(loss, self._aux_params, allow_unused=True)
-            _step(self._aux_optimizer, self._aux_params, grads, None)
-            if cfg.tune_alpha and cfg.alpha > 0:
-                # Bounded itself, not just where it is read: so it comes back at once when entropy returns.
-                with torch.no_grad():
-                    self._log_alpha.clamp_(max=math.log(cfg.max_alpha / cfg.alpha))
+            gap = imagined.log_pi.detach().mean() + target
+            terms.append(-optimizer.vector[log_alpha].sum() * gap)
+        if terms:
+            (grad,) = torch.autograd.grad(sum(terms[1:], terms[0]), [optimizer.vector])
+            optimizer.step(grad)
+        if tune_alpha:
+            # Bounded itself, not just where it is read: so it comes back at once when entropy returns.
+            with torch.no_grad():
+                optimizer.vector[log_alpha].clamp_(max=math.log(cfg.max_alpha / cfg.alpha))
         return metrics
+
+    def _log_posterior(self, imagined: Imagined, latent: Tensor) -> Tensor:
+        assert self.posterior is not None
+        latents = latent.expand(imagined.actions.shape[0], *latent.shape)
+        with self._autocast():
+            log_p = self.posterior.log_prob(imagined.states[:-1].detach(), imagined.actions.detach(), latents)
+        return log_p.mean()
+
+    @torch.no_grad()
+    def _encoded(self, obs: Tensor) -> Tensor:
+        state: Tensor = self.model.encode(self._input(obs))
+        return state
 
     @torch.no_grad()
     def _value_of_starts(self, obs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Encoded starts, z drawn for them, and Eq. 3.3 for each: what pi(z|s1) climbs."""
         cfg = self.config
-        state = self.model.encoder(self._input(obs)).float()
+        state = self._encoded(obs).float()
         latent = self.prior.sample(len(obs), state)
         imagined = imagine(self.model, self.policy, state, latent, cfg.actor_horizon, self.alpha)
         shaped = shaped_reward(imagined, latent, self.posterior, self.alpha, self.beta)
@@ -273,8 +357,8 @@ class RPG(Agent):
             "policy": self.policy.state_dict(),
             "posterior": self.posterior.state_dict() if self.posterior is not None else {},
             "prior": self.prior.state_dict(),
-            "log_alpha": self._log_alpha.detach().clone(),
-            "log_beta": self._log_beta.detach().clone(),
+            "log_alpha": self._aux.log_alpha.detach().clone(),
+            "log_beta": self._aux.log_beta.detach().clone(),
             "model_optimizer": self._model_optimizer.state_dict(),
             "policy_optimizer": self._policy_optimizer.state_dict(),
             "aux_optimizer": self._aux_optimizer.state_dict(),
@@ -290,25 +374,9 @@ class RPG(Agent):
             self.posterior.load_state_dict(state["posterior"])
         self.prior.load_state_dict(state["prior"])
         with torch.no_grad():
-            self._log_alpha.copy_(state["log_alpha"])
-            self._log_beta.copy_(state["log_beta"])
+            self._aux.log_alpha.copy_(state["log_alpha"])
+            self._aux.log_beta.copy_(state["log_beta"])
         self._model_optimizer.load_state_dict(state["model_optimizer"])
         self._policy_optimizer.load_state_dict(state["policy_optimizer"])
         self._aux_optimizer.load_state_dict(state["aux_optimizer"])
         self._updates = state["updates"]
-
-
-def _step(
-    optimizer: torch.optim.Optimizer,
-    params: list[Tensor],
-    grads: tuple[Tensor | None, ...],
-    clip: float | None,
-) -> Tensor:
-    """Apply gradients, clipped to a global norm; returns the norm before clipping."""
-    for param, grad in zip(params, grads, strict=True):
-        param.grad = grad
-    norm = torch.zeros(())
-    if clip is not None:
-        norm = torch.nn.utils.clip_grad_norm_(params, clip, foreach=True)
-    optimizer.step()
-    return norm

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from torch import Tensor
+import torch
+from torch import Tensor, nn
 
 from rpg.errors import RPGError
 
@@ -59,3 +60,22 @@ class ObjectsOfInterest:
         """Object scalars of ``obs``: (..., obs_dim) -> (..., k)."""
         picked = obs[..., list(self.index)]
         return (picked - obs.new_tensor(self.offset)) * obs.new_tensor(self.scale)
+
+
+class ObjectSelector(nn.Module):
+    """:meth:`ObjectsOfInterest.select` with its constants on the device, for repeated use."""
+
+    index: Tensor
+    scale: Tensor
+    offset: Tensor
+
+    def __init__(self, objects: ObjectsOfInterest) -> None:
+        super().__init__()
+        self.dim = objects.dim
+        self.register_buffer("index", torch.tensor(objects.index, dtype=torch.long), persistent=False)
+        self.register_buffer("scale", torch.tensor(objects.scale), persistent=False)
+        self.register_buffer("offset", torch.tensor(objects.offset), persistent=False)
+
+    def forward(self, obs: Tensor) -> Tensor:
+        """(..., obs_dim) -> (..., k)."""
+        return (obs.index_select(-1, self.index) - self.offset) * self.scale

@@ -8,10 +8,12 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from rpg.compiling import compile_region, keep_address
 from rpg.errors import RPGError
 from rpg.exploration.normalizer import RunningNormalizer
-from rpg.exploration.objects import ObjectsOfInterest
+from rpg.exploration.objects import ObjectSelector, ObjectsOfInterest
 from rpg.exploration.positional import encoded_dim, positional_encoding
+from rpg.flat import FlatAdam
 from rpg.segments import SegmentBatch
 
 
@@ -25,6 +27,7 @@ class RNDConfig:
         frequencies: octaves of the positional encoding; 0 turns it off.
         capacity: observations in the estimator's own buffer; a small one forgets (Fig. 3.13 D).
         batch_size: observations per predictor update.
+        update_every: calls per predictor update.
         lr: learning rate of the predictor.
         clip: largest absolute normalised error.
         warmup: predictor updates before errors are normalised.
@@ -36,6 +39,7 @@ class RNDConfig:
     frequencies: int = 6
     capacity: int = 800_000
     batch_size: int = 512
+    update_every: int = 1
     lr: float = 3e-4
     clip: float = 100.0
     warmup: int = 100
@@ -47,10 +51,10 @@ class RNDConfig:
                 f"exploration: capacity={self.capacity} must be at least batch_size={self.batch_size}, "
                 f"both and width={self.width} positive"
             )
-        if not 0 <= self.forgetting < 1 or self.frequencies < 0 or self.lr <= 0:
+        if not 0 <= self.forgetting < 1 or self.frequencies < 0 or self.lr <= 0 or self.update_every < 1:
             raise RPGError(
                 f"exploration: forgetting={self.forgetting} must be in [0, 1), "
-                f"frequencies={self.frequencies} >= 0, lr={self.lr} > 0"
+                f"frequencies={self.frequencies} >= 0, lr={self.lr} > 0, update_every={self.update_every} >= 1"
             )
 
 
@@ -71,19 +75,30 @@ class RandomNetworkDistillation:
         self, objects: ObjectsOfInterest, config: RNDConfig, device: torch.device | str = "cpu"
     ) -> None:
         self.config = config
-        self._objects = objects
+        self._select = ObjectSelector(objects).to(device)
         in_dim = encoded_dim(objects.dim, config.frequencies)
         self._target = _rnd_net(in_dim, config.width).to(device).requires_grad_(False)
         self._predictor = _rnd_net(in_dim, config.width).to(device)
         self._normalizer = RunningNormalizer(config.forgetting, config.warmup).to(device)
-        self._optimizer = torch.optim.Adam(self._predictor.parameters(), lr=config.lr, fused=True)
+        self._optimizer = FlatAdam(self._predictor, config.lr)
+        self._device = torch.device(device)
         self._buffer = torch.empty(config.capacity, objects.dim, device=device)
         self._stored = 0
+        self._ticks = 0
+        self._learn_region, self._bonus_region = self._learn, self._bonus
+
+    def compile(self) -> None:
+        """Compile predictor step and bonus; results are those of the plain functions up to rounding."""
+        optimizer = self._optimizer
+        keep_address(optimizer.vector, optimizer.mean, optimizer.square, optimizer.count)
+        keep_address(*self._normalizer.buffers())
+        self._learn_region = compile_region(self._learn, "density", self._device)
+        self._bonus_region = compile_region(self._bonus, "bonus", self._device)
 
     def observe(self, obs: Tensor) -> None:
         """Remember observations (n, obs_dim)."""
-        picked = self._objects.select(obs)
-        rows = (torch.arange(len(picked)) + self._stored) % self.config.capacity
+        picked = self._select(obs)
+        rows = (torch.arange(len(picked), device=self._device) + self._stored) % self.config.capacity
         self._buffer[rows] = picked
         self._stored += len(picked)
 
@@ -93,35 +108,50 @@ class RandomNetworkDistillation:
         return self._stored >= self.config.batch_size
 
     def update(self) -> dict[str, Tensor]:
-        """One gradient step of the predictor on remembered observations; scalars stay on the device."""
+        """One gradient step of the predictor on remembered observations; scalars stay on the device.
+
+        With ``update_every`` above 1 only every n-th call takes one; the others return nothing.
+        """
+        self._ticks += 1
+        if (self._ticks - 1) % self.config.update_every:
+            return {}
         filled = min(self._stored, self.config.capacity)
-        rows = torch.randint(filled, (self.config.batch_size,), device=self._buffer.device)
-        errors = self._error(self._buffer[rows])
+        rows = torch.randint(filled, (self.config.batch_size,), device=self._device)
+        return self._learn_region(self._buffer[rows])
+
+    def _learn(self, picked: Tensor) -> dict[str, Tensor]:
+        optimizer = self._optimizer
+        predictor = optimizer.views(optimizer.vector)
+        errors = self._error(predictor, picked)
         loss = errors.mean()
-        self._optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        self._optimizer.step()
+        (grad,) = torch.autograd.grad(loss, [optimizer.vector])
+        norm = optimizer.step(grad)
         self._normalizer.update(errors.detach())
-        return {"loss/rnd": loss.detach()}
+        return {"loss/rnd": loss.detach(), "train/rnd_grad_norm": norm}
 
     def relabel(self, batch: SegmentBatch) -> SegmentBatch:
         """Attach the bonus of each step's next observation, as judged now."""
-        return batch._replace(bonus=self.bonus(batch.next_obs))
+        return batch._replace(bonus=self._bonus_region(batch.next_obs))
 
-    @torch.no_grad()
     def bonus(self, obs: Tensor) -> Tensor:
         """Exploration reward (...) of observations (..., obs_dim), weighted by the coefficient."""
+        return self._bonus(obs)
+
+    @torch.no_grad()
+    def _bonus(self, obs: Tensor) -> Tensor:
         errors = self._normalizer(self.error(obs))
         return self.config.coefficient * errors.clamp(-self.config.clip, self.config.clip)
 
     @torch.no_grad()
     def error(self, obs: Tensor) -> Tensor:
         """Raw prediction error (...), the sum over the networks' outputs."""
-        return self._error(self._objects.select(obs))
+        optimizer = self._optimizer
+        return self._error(optimizer.views(optimizer.vector), self._select(obs))
 
-    def _error(self, picked: Tensor) -> Tensor:
+    def _error(self, predictor: dict[str, Tensor], picked: Tensor) -> Tensor:
         encoded = positional_encoding(picked, self.config.frequencies)
-        return (self._predictor(encoded) - self._target(encoded)).square().sum(-1)
+        predicted: Tensor = torch.func.functional_call(self._predictor, predictor, (encoded,))
+        return (predicted - self._target(encoded)).square().sum(-1)
 
     def state_dict(self) -> dict[str, Any]:
         """Tensors and plain data only; of the buffer only what is filled."""
@@ -132,6 +162,7 @@ class RandomNetworkDistillation:
             "optimizer": self._optimizer.state_dict(),
             "buffer": self._buffer[: self._stored].clone(),
             "stored": self._stored,
+            "ticks": self._ticks,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -141,7 +172,7 @@ class RandomNetworkDistillation:
         self._normalizer.load_state_dict(state["normalizer"])
         self._optimizer.load_state_dict(state["optimizer"])
         self._buffer[: len(state["buffer"])] = state["buffer"]
-        self._stored = state["stored"]
+        self._stored, self._ticks = state["stored"], state["ticks"]
 
 
 def _rnd_net(in_dim: int, width: int) -> nn.Sequential:

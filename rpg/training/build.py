@@ -12,6 +12,7 @@ from omegaconf.errors import ConfigKeyError, MissingMandatoryValue, OmegaConfBas
 
 from rpg.agents import RPG, Agent, RPGConfig
 from rpg.agents.scripted import SCRIPTED, make_scripted
+from rpg.compiling import compiler_missing
 from rpg.envs.config import EnvConfig
 from rpg.envs.make import declared_objects, make_envs
 from rpg.errors import CheckpointError, RPGError, nearest
@@ -64,7 +65,8 @@ def parse_config(cfg: DictConfig) -> RunConfig:
         trainer=_section(TrainerConfig, plain["trainer"], "trainer"),
         logger=_section(LoggerConfig, plain["logger"], "logger"),
         seed=plain["seed"],
-        device=_device(plain["device"]),
+        device=(device := _device(plain["device"])),
+        compile=_compile(plain.get("compile"), device) and learner,
         threads=threads,
         run_dir=plain["run_dir"],
         plain=plain,
@@ -110,6 +112,15 @@ def _device(name: str) -> str:
     return name
 
 
+def _compile(wanted: Any, device: str) -> bool:
+    if wanted not in ("auto", True, False):
+        raise RPGError(f"compile={wanted!r}: choose auto, true or false")
+    missing = compiler_missing(torch.device(device)) if wanted else None
+    if wanted is True and missing:
+        raise RPGError(f"compile=true: {missing}; install one, or take compile=auto or false")
+    return bool(wanted) and not missing
+
+
 def build_agent(run: RunConfig, envs: Any) -> tuple[Agent, ObjectsOfInterest]:
     """Make the agent for these environments, and the objects of interest it was told of."""
     obs_space, action_space = envs.single_observation_space, envs.single_action_space
@@ -137,7 +148,7 @@ def build_trainer(run: RunConfig) -> Trainer:
     if run.exploration_name == "rnd":
         exploration = RandomNetworkDistillation(objects, run.exploration, run.device)
     run_dir = Path(run.run_dir)
-    return Trainer(
+    trainer = Trainer(
         agent=agent,
         exploration=exploration,
         envs=envs,
@@ -150,6 +161,9 @@ def build_trainer(run: RunConfig) -> Trainer:
         env_name=run.env.name,
         action_repeat=run.env.action_repeat,
     )
+    if run.compile:
+        trainer.compile()
+    return trainer
 
 
 def _sinks(run: RunConfig, run_dir: Path) -> list[Sink]:
@@ -162,7 +176,7 @@ def _sinks(run: RunConfig, run_dir: Path) -> list[Sink]:
 
 
 # Settings that may change between restarts without making it another run.
-_FREE = ("trainer.steps", "trainer.checkpoint_every", "device", "threads", "run_dir", "logger")
+_FREE = ("trainer.steps", "trainer.checkpoint_every", "device", "compile", "threads", "run_dir", "logger")
 
 
 def require_same_run(path: Path, run: RunConfig) -> dict[str, Any]:

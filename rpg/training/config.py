@@ -72,6 +72,7 @@ class RunConfig:
     logger: LoggerConfig
     seed: int
     device: str
+    compile: bool
     threads: int | None
     run_dir: str
     plain: dict[str, Any] = field(default_factory=dict)

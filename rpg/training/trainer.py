@@ -95,6 +95,12 @@ class Trainer:
         """Seconds of training, summed over restarts."""
         return self._wall_before + time.perf_counter() - self._clock
 
+    def compile(self) -> None:
+        """Compile the learning step: agent and exploration."""
+        self.agent.compile()
+        if self.exploration is not None:
+            self.exploration.compile()
+
     def train(
         self,
         should_stop: Callable[[], bool] = lambda: False,

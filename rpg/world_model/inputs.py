@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from rpg.exploration.objects import ObjectsOfInterest
+from rpg.exploration.objects import ObjectSelector, ObjectsOfInterest
 from rpg.exploration.positional import encoded_dim, positional_encoding
 
 _LARGEST = 1e3  # sensible inputs are of order one
@@ -21,7 +21,7 @@ class ObservationInput(nn.Module):
 
     def __init__(self, obs_dim: int, objects: ObjectsOfInterest, obs_scale: float, frequencies: int) -> None:
         super().__init__()
-        self._objects = objects
+        self._select = ObjectSelector(objects)
         self._obs_scale = obs_scale
         self._frequencies = frequencies
         self.dim = obs_dim + encoded_dim(objects.dim, frequencies)
@@ -29,6 +29,6 @@ class ObservationInput(nn.Module):
     def forward(self, obs: Tensor) -> Tensor:
         """(..., obs_dim) -> (..., dim)."""
         # An absurd reading must not push the networks to where float32 overflows when squared.
-        objects = self._objects.select(obs).clamp(-_LARGEST, _LARGEST)
+        objects = self._select(obs).clamp(-_LARGEST, _LARGEST)
         raw = (obs * self._obs_scale).clamp(-_LARGEST, _LARGEST)
         return torch.cat([raw, positional_encoding(objects, self._frequencies)], dim=-1)

@@ -43,7 +43,7 @@ def model_losses(
             ``v``, of Q(s_t, a_t, z) for critic ``q``.
     """
     embedded = model.dynamics.embed(actions)
-    first = model.encoder(inputs)
+    first = model.encode(inputs)
     states = model.unroll(first, embedded)  # (K, N, state_dim)
     latents = latent.expand(actions.shape[0], *latent.shape)
     if model.critic == "v":

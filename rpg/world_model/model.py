@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from rpg.networks import TwinMLP, mlp
 from rpg.world_model.config import WorldModelConfig
-from rpg.world_model.dynamics import DYNAMICS
+from rpg.world_model.dynamics import DYNAMICS, GRUDynamics, ResidualDynamics
 
 
 class WorldModel(nn.Module):
@@ -27,11 +27,15 @@ class WorldModel(nn.Module):
         state, width, act = config.state_dim, config.width, config.activation
         self.critic = config.critic
         self.encoder = mlp(input_dim, width, state, act)
-        self.dynamics = DYNAMICS[config.dynamics](action_dim, config)
+        self.dynamics: GRUDynamics | ResidualDynamics = DYNAMICS[config.dynamics](action_dim, config)
         embedded = self.dynamics.embedded_dim
         self.reward_head = mlp(state + embedded, width, 1, act)
         critic_dim = state + latent_dim + (embedded if config.critic == "q" else 0)
         self.value_heads = TwinMLP(critic_dim, width, act)
+
+    def encode(self, inputs: Tensor) -> Tensor:
+        """Latent state (..., state_dim) of scaled and encoded observations (..., input_dim)."""
+        return self.dynamics.bound(self.encoder(inputs))
 
     def unroll(self, state: Tensor, embedded_actions: Tensor) -> Tensor:
         """Latent states after each of a given sequence of actions.

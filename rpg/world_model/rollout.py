@@ -33,6 +33,7 @@ def imagine(
     latent: Tensor,
     horizon: int,
     alpha: Tensor | None = None,
+    noise: Tensor | None = None,
 ) -> Imagined:
     """Follow the policy inside the model.
 
@@ -43,12 +44,14 @@ def imagine(
         latent: (N, latent_dim), one z for the whole rollout.
         horizon: number of model steps H.
         alpha: weight of the entropy of the bootstrap's own action (critic ``q`` only); None leaves it out.
+        noise: (1, H, N, action_dim) standard normal, for critic ``q`` (2, H, N, action_dim) with the
+            bootstrap's own; None draws it.
     """
     states, actions, log_pis, embeddeds = [state], [], [], []
     dynamics = model.dynamics
     hidden = dynamics.start(state)
-    for _ in range(horizon):
-        action, log_pi = policy(states[-1], latent).rsample()
+    for step in range(horizon):
+        action, log_pi = policy(states[-1], latent).rsample(None if noise is None else noise[0, step])
         embedded = dynamics.embed(action)
         hidden = dynamics.step(hidden, embedded)
         states.append(dynamics.readout(hidden))
@@ -61,7 +64,7 @@ def imagine(
     if model.critic == "v":
         bootstrap = model.value(reached, latents)
     else:
-        action, log_pi = policy(reached, latents).rsample()
+        action, log_pi = policy(reached, latents).rsample(None if noise is None else noise[1])
         bootstrap = model.q_value(reached, dynamics.embed(action), latents)
         if alpha is not None:
             bootstrap = bootstrap - alpha * log_pi

@@ -1,0 +1,100 @@
+"""Compiled regions: the same functions, traced once and run as few fused kernels.
+
+A region is a function of tensors with fixed shapes. :func:`compile_region` hands it to ``torch.compile``; where
+no compiler is present, or compiling fails, the plain function runs instead and says so once.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, ParamSpec, TypeVar
+
+import torch
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+_CACHE = "TORCHINDUCTOR_CACHE_DIR"
+
+
+class CompileLog:
+    """How long the regions of this process took to compile.
+
+    Attributes:
+        seconds: by region, of its first call.
+        failed: region and first line of the error, where the plain function took over.
+    """
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self.failed: dict[str, str] = {}
+
+
+LOG = CompileLog()
+
+
+def compiler_missing(device: torch.device) -> str | None:
+    """Why nothing can be compiled for ``device``, or None if it can."""
+    if device.type == "cpu":
+        wanted = [os.environ["CXX"]] if "CXX" in os.environ else ["g++", "clang++", "c++"]
+        return (
+            None if any(shutil.which(name) for name in wanted) else f"no C++ compiler ({', '.join(wanted)})"
+        )
+    if device.type == "cuda":
+        try:
+            import triton  # noqa: F401
+        except ImportError:
+            return "triton is not installed"
+        return None
+    return f"no compiler for {device.type}"
+
+
+def compile_region(function: Callable[P, R], name: str, device: torch.device) -> Callable[P, R]:
+    """``function`` compiled for fixed shapes; on a GPU recorded as a CUDA graph.
+
+    Artefacts are kept in ``~/.cache/rpg/compiled`` (or ``TORCHINDUCTOR_CACHE_DIR``) and found again by later
+    processes.
+
+    Args:
+        function: tensors in, tensors out; draws no random numbers of its own.
+        name: for :data:`LOG` and messages.
+        device: that all tensors live on.
+    """
+    os.environ.setdefault(_CACHE, str(Path.home() / ".cache" / "rpg" / "compiled"))
+    import torch._dynamo  # takes a second; nothing else here needs it
+
+    torch._dynamo.config.trace_autograd_ops = True  # autograd.grad inside a region
+    # Names in torch's own warnings about code that is meant to run this way.
+    mode = "reduce-overhead" if device.type == "cuda" else "default"
+    compiled: Callable[P, R] = torch.compile(function, fullgraph=True, dynamic=False, mode=mode)
+    chosen: list[Callable[P, R]] = []
+
+    def region(*args: P.args, **kwargs: P.kwargs) -> R:
+        if chosen:
+            return chosen[0](*args, **kwargs)
+        start = time.perf_counter()
+        try:
+            result = compiled(*args, **kwargs)
+        except torch._dynamo.exc.TorchDynamoException as error:
+            LOG.failed[name] = str(error).strip().splitlines()[0]
+            warnings.warn(f"{name}: not compiled, runs eagerly: {LOG.failed[name]}", stacklevel=2)
+            chosen.append(function)
+            return function(*args, **kwargs)
+        LOG.seconds[name] = time.perf_counter() - start
+        chosen.append(compiled)
+        return result
+
+    return region
+
+
+def keep_address(*tensors: Any) -> None:
+    """Tell the compiler that these tensors are updated in place and never replaced (needed by CUDA graphs)."""
+    import torch._dynamo
+
+    for tensor in tensors:
+        torch._dynamo.mark_static_address(tensor)
