@@ -45,7 +45,10 @@ figures: $(VENV)/.core
 	$(BIN)/python scripts/figure_bandit.py --redraw
 
 bench: $(VENV)/.core
-	$(BIN)/python benchmarks/learning.py --out benchmarks/output
+	$(BIN)/python benchmarks/learning.py --against eager --out benchmarks/output
+	$(BIN)/python benchmarks/replay.py --out benchmarks/output
+	$(BIN)/python benchmarks/act.py --out benchmarks/output
+	$(BIN)/python benchmarks/table.py
 
 clean:
 	rm -rf $(VENV) runs multirun site build *.egg-info

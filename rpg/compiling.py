@@ -33,6 +33,15 @@ class CompileLog:
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
         self.failed: dict[str, str] = {}
+        self._told = 0
+
+    def news(self) -> str:
+        """One line on what was compiled since the last call; empty if nothing was."""
+        new, self._told = list(self.seconds.items())[self._told :], len(self.seconds)
+        if not new:
+            return ""
+        names, spent = ", ".join(name for name, _ in new), sum(seconds for _, seconds in new)
+        return f"compiled {names} in {spent:.0f} s; kept in {os.environ[_CACHE]} for the next time"
 
 
 LOG = CompileLog()
@@ -69,7 +78,6 @@ def compile_region(function: Callable[P, R], name: str, device: torch.device) ->
     import torch._dynamo  # takes a second; nothing else here needs it
 
     torch._dynamo.config.trace_autograd_ops = True  # autograd.grad inside a region
-    # Names in torch's own warnings about code that is meant to run this way.
     mode = "reduce-overhead" if device.type == "cuda" else "default"
     compiled: Callable[P, R] = torch.compile(function, fullgraph=True, dynamic=False, mode=mode)
     chosen: list[Callable[P, R]] = []

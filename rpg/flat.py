@@ -61,7 +61,7 @@ class FlatAdam(FlatParameters):
 
     def __init__(self, module: nn.Module, lr: float, clip: float | None = None) -> None:
         super().__init__(module)
-        self._lr, self._clip = lr, clip
+        self.lr, self._clip = lr, clip
         self.mean = torch.zeros_like(self.vector.data)
         self.square = torch.zeros_like(self.vector.data)
         self.count = torch.zeros((), device=self.vector.device)
@@ -79,7 +79,7 @@ class FlatAdam(FlatParameters):
         # 1 - beta^count, exact also where beta^count is close to 1.
         mean_bias = -torch.expm1(self.count * math.log(beta1))
         root_bias = (-torch.expm1(self.count * math.log(beta2))).sqrt()
-        scale = self._lr * root_bias / mean_bias
+        scale = self.lr * root_bias / mean_bias
         self.vector.sub_(scale * self.mean / (self.square.sqrt() + self.eps * root_bias))
         return norm
 

@@ -3,9 +3,11 @@
     rpg-plot runs/maze
     rpg-plot 'runs/rpg_*' 'runs/mbsac_*' --metric eval/stochastic/success_end --out success.png
     rpg-plot runs --group agent,exploration.coefficient
+    rpg-plot pareto runs --group agent,size.name --out pareto.png
 
 Writes a picture, against environment steps and against wall-clock time, and beside it a CSV with the same
-curves: interquartile mean over the seeds of a group and its 95 % stratified bootstrap interval.
+curves: interquartile mean over the seeds of a group and its 95 % stratified bootstrap interval. With ``pareto``
+first, the picture shows speed against accuracy, see :mod:`rpg.pareto`.
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from rpg import figures
+from rpg import figures, pareto
 from rpg.errors import RPGError, nearest
 from rpg.stats import FloatArray, iqm, stratified_bootstrap
 from rpg.training.loggers import COUNTERS, Row, read_rows, write_atomic
@@ -221,16 +223,26 @@ def write_csv(curves: Sequence[Curve], metric: str, path: Path) -> None:
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command line; returns 0, or 2 after printing what the user can mend."""
-    parser = argparse.ArgumentParser(prog="rpg-plot", description="Draw learning curves from run folders.")
+    words = sys.argv[1:] if argv is None else argv
+    chart = words[:1] == ["pareto"]
+    parser = argparse.ArgumentParser(
+        prog="rpg-plot pareto" if chart else "rpg-plot",
+        description="Draw speed against accuracy, from run folders."
+        if chart
+        else "Draw learning curves from run folders; 'rpg-plot pareto ...' draws speed against accuracy.",
+    )
     parser.add_argument("runs", nargs="+", help="run folders, folders above them, or quoted globs")
     parser.add_argument("--metric", default="train/coverage", help="default: %(default)s")
     parser.add_argument(
-        "--out", type=Path, default=Path("plot.png"), help=".png, .pdf or .svg; a .csv goes beside it"
+        "--out",
+        type=Path,
+        default=Path("pareto.png" if chart else "plot.png"),
+        help=".png, .pdf or .svg; a .csv goes beside it (default: %(default)s)",
     )
     parser.add_argument(
         "--group", default="agent,env", help="config keys that tell groups apart (default: %(default)s)"
     )
-    args = parser.parse_args(argv)
+    args = parser.parse_args(words[1:] if chart else words)
     try:
         figures.check_ending(args.out)
         runs = [load_run(path) for path in find_runs(args.runs)]
@@ -241,13 +253,15 @@ def main(argv: list[str] | None = None) -> int:
             raise RPGError(f"no run has the metric '{args.metric}'; {nearest(args.metric, metrics)}")
         groups = group_runs(runs, [key.strip() for key in args.group.split(",")])
         curves = [aggregate(name, members, args.metric) for name, members in groups.items()]
-        write_csv(curves, args.metric, args.out.with_suffix(".csv"))
-        draw(curves, args.metric, args.out)
+        (pareto.write_csv if chart else write_csv)(curves, args.metric, args.out.with_suffix(".csv"))
+        (pareto.draw if chart else draw)(curves, args.metric, args.out)
     except RPGError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     for curve, members in zip(curves, groups.values(), strict=True):
         _tell_short_runs(curve, members, args.metric)
+    if chart:
+        _tell_unequal_ends(curves)
     print(
         f"wrote {args.out} and {args.out.with_suffix('.csv')} from {len(runs)} runs, group sizes"
         f" {', '.join(str(len(members)) for members in groups.values())}"
@@ -267,6 +281,17 @@ def _tell_short_runs(curve: Curve, runs: Sequence[Run], metric: str) -> None:
         print(
             f"note: '{curve.group}' is drawn to {figures.short_count(shortest)} env steps, where"
             f" {ends[shortest]} ends; its longest run reaches {figures.short_count(longest)}",
+            file=sys.stderr,
+        )
+
+
+def _tell_unequal_ends(curves: Sequence[Curve]) -> None:
+    ends = {curve.env_steps[-1]: curve.group for curve in curves}
+    shortest, longest = min(ends), max(ends)
+    if longest > 1.02 * shortest:
+        print(
+            f"note: final values are of unequal lengths: '{ends[shortest]}' ends at"
+            f" {figures.short_count(shortest)} env steps, '{ends[longest]}' at {figures.short_count(longest)}",
             file=sys.stderr,
         )
 

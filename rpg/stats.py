@@ -1,4 +1,4 @@
-"""Aggregates for few-seed experiments: interquartile mean, stratified bootstrap, probability of improvement.
+"""Aggregates for few-seed experiments: interquartile mean, stratified bootstrap, probability of improvement, front.
 
 The definitions are those of Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical
 Precipice" (NeurIPS 2021), as computed by their package ``rliable`` 1.2.0; ``tests/test_stats.py`` holds
@@ -120,6 +120,28 @@ def probability_of_improvement(x: ArrayLike, y: ArrayLike) -> float:
         )
     difference = left[:, None] - right[None, :]  # (seeds_x, seeds_y, tasks)
     return float((difference > 0).mean() + 0.5 * (difference == 0).mean())
+
+
+def pareto_front(cost: ArrayLike, value: ArrayLike) -> NDArray[np.intp]:
+    """The points that no other beats: none is as cheap and as good, and cheaper or better.
+
+    Args:
+        cost: ``(n,)``, lower is better.
+        value: ``(n,)``, higher is better.
+
+    Returns:
+        ``(k,)`` indices, the cheapest first; value rises with cost. Equal points are on the front together.
+
+    Raises:
+        RPGError: the shapes do not fit, or a number is not finite.
+    """
+    costs, values = _finite(cost, "pareto_front: cost"), _finite(value, "pareto_front: value")
+    if costs.ndim != 1 or costs.shape != values.shape:
+        raise RPGError(f"pareto_front: shapes {costs.shape} and {values.shape}, need (n,) twice")
+    cheaper, better = costs[:, None] - costs, values - values[:, None]  # [i, j]: by how much j beats i
+    beaten = ((cheaper >= 0) & (better >= 0) & ((cheaper > 0) | (better > 0))).any(axis=1)
+    front = np.flatnonzero(~beaten)
+    return front[np.argsort(costs[front], kind="stable")]
 
 
 def _finite(x: ArrayLike, caller: str) -> FloatArray:

@@ -22,6 +22,7 @@ from typing import Any
 import hydra
 from omegaconf import DictConfig, OmegaConf
 
+from rpg import compiling
 from rpg.cli import check_overrides, command_line, report_errors
 from rpg.provenance import provenance
 from rpg.training.build import build_trainer, parse_config, require_same_run
@@ -73,6 +74,8 @@ def train(cfg: DictConfig) -> dict[str, Any]:
     trainer, progress = assemble(cfg)
 
     def show(row: Row) -> None:
+        if row["updates"] and (told := compiling.LOG.news()):
+            progress.note(told)
         shown = {key: row[key] for key in _SHOWN if key in row}
         progress.update(int(row["env_steps"]), int(row["updates"]), shown)
 

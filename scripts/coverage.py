@@ -13,11 +13,10 @@ from __future__ import annotations
 import argparse
 import csv
 import json
-import subprocess
-import sys
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+
+from side_by_side import Job, run_side_by_side, write_table
 
 _RUNS = Path("runs/coverage")
 _OUT = Path("results/maze/coverage.csv")
@@ -78,40 +77,25 @@ VARIANTS = {
 }
 
 
-def command(name: str, variant: Variant, seed: int) -> list[str]:
-    """The `rpg-train` command of one run."""
-    return [
-        sys.executable, "-m", "rpg.train", f"agent={variant.agent}", "env=maze", f"size={variant.preset}",
-        f"seed={seed}", "threads=1", "logger=files", f"trainer.steps={variant.steps}", "trainer.eval_every=0",
-        *variant.overrides, f"run_dir={_RUNS / name / f'seed{seed}'}",
-    ]  # fmt: skip
+def job(name: str, seed: int) -> Job:
+    """One run of a variant."""
+    variant = VARIANTS[name]
+    overrides = (
+        f"agent={variant.agent}", "env=maze", f"size={variant.preset}", f"seed={seed}",
+        f"trainer.steps={variant.steps}", *variant.overrides,
+    )  # fmt: skip
+    return Job(f"{name} seed {seed}", _RUNS / name / f"seed{seed}", overrides)
 
 
 def run(names: list[str], jobs: int, seeds: list[int] | None) -> int:
     """Run the variants, seed by seed, ``jobs`` at a time; returns the number of failures."""
     todo = [
-        (seed, name)
+        job(name, seed)
         for seed in range(max(max(VARIANTS[n].seeds) for n in names) + 1)
         for name in names
         if seed in (seeds or VARIANTS[name].seeds)
     ]
-
-    def one(job: tuple[int, str]) -> int:
-        seed, name = job
-        folder = _RUNS / name / f"seed{seed}"
-        folder.mkdir(parents=True, exist_ok=True)
-        with (folder / "output.txt").open("a") as output:
-            done = subprocess.run(
-                command(name, VARIANTS[name], seed), stdout=output, stderr=output, check=False
-            )
-        print(
-            f"{name} seed {seed}: {'done' if done.returncode == 0 else f'failed, see {output.name}'}",
-            flush=True,
-        )
-        return done.returncode != 0
-
-    with ThreadPoolExecutor(jobs) as pool:
-        return sum(pool.map(one, todo))
+    return run_side_by_side(todo, jobs)
 
 
 def gather() -> int:
@@ -143,12 +127,8 @@ def gather() -> int:
     if _OUT.exists():
         with _OUT.open() as file:
             kept = [row for row in csv.DictReader(file) if (row["variant"], row["seed"]) not in made]
-    _OUT.parent.mkdir(parents=True, exist_ok=True)
     rows = sorted(kept + fresh, key=lambda r: (r["variant"], int(r["seed"]), int(r["env_steps"])))
-    with _OUT.open("w", newline="") as file:
-        writer = csv.DictWriter(file, _COLUMNS, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    write_table(_OUT, _COLUMNS, rows)
     print(f"{_OUT}: {len(rows)} rows, {len({(r['variant'], r['seed']) for r in rows})} runs")
     return 0
 
@@ -164,7 +144,7 @@ def main() -> int:
     names = args.variants or list(VARIANTS)
     if args.action == "list":
         for name in names:
-            print(f"{name:18} {' '.join(command(name, VARIANTS[name], 0)[3:])}")
+            print(f"{name:18} {' '.join(job(name, 0).command[3:])}")
         return 0
     if args.action == "run":
         return run(names, args.jobs, args.seeds)

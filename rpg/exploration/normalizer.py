@@ -18,18 +18,35 @@ class RunningNormalizer(nn.Module):
         warmup: updates before :meth:`forward` starts to normalise; until then input passes unchanged.
     """
 
-    mean: Tensor
-    var: Tensor
-    weight: Tensor
-    updates: Tensor
+    stats: Tensor
 
     def __init__(self, forgetting: float = 0.0, warmup: int = 0) -> None:
         super().__init__()
         self._forgetting = forgetting
         self._warmup = max(warmup, 1)  # before the first update there is nothing to normalise by
-        # Double precision: after 1e6 batches a float32 weight could no longer grow by one batch.
-        for name in ("mean", "var", "weight", "updates"):
-            self.register_buffer(name, torch.zeros((), dtype=torch.float64))
+        # Double precision: after 1e6 batches a float32 weight could no longer grow by one batch. One vector:
+        # torch 2.13 drops what compiled code writes into a 0-d float64 tensor on a CPU.
+        self.register_buffer("stats", torch.zeros(4, dtype=torch.float64))
+
+    @property
+    def mean(self) -> Tensor:
+        """Mean of what was seen, as are the following, a scalar."""
+        return self.stats[0]
+
+    @property
+    def var(self) -> Tensor:
+        """Variance."""
+        return self.stats[1]
+
+    @property
+    def weight(self) -> Tensor:
+        """Values seen, forgotten ones discounted."""
+        return self.stats[2]
+
+    @property
+    def updates(self) -> Tensor:
+        """Batches seen."""
+        return self.stats[3]
 
     @torch.no_grad()
     def update(self, values: Tensor) -> None:
@@ -37,13 +54,12 @@ class RunningNormalizer(nn.Module):
         batch = values.double()
         count = float(batch.numel())
         batch_var, batch_mean = torch.var_mean(batch, correction=0)
-        kept = self.weight * (1.0 - self._forgetting)
+        mean, var, weight, updates = self.stats.unbind()
+        kept = weight * (1.0 - self._forgetting)
         total = kept + count
-        delta = batch_mean - self.mean
-        self.mean += delta * (count / total)
-        self.var.copy_((kept * self.var + count * batch_var + delta.square() * kept * count / total) / total)
-        self.weight.copy_(total)
-        self.updates += 1
+        delta = batch_mean - mean
+        new_var = (kept * var + count * batch_var + delta.square() * kept * count / total) / total
+        self.stats.copy_(torch.stack([mean + delta * (count / total), new_var, total, updates + 1.0]))
 
     def forward(self, values: Tensor) -> Tensor:
         """(values - mean) / std, same shape; unchanged during warm-up."""

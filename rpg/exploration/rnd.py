@@ -32,6 +32,8 @@ class RNDConfig:
         clip: largest absolute normalised error.
         warmup: predictor updates before errors are normalised.
         forgetting: see :class:`RunningNormalizer`.
+        relabel: judge the novelty of sampled states anew every time, as published; otherwise a transition
+            keeps the bonus it had when it was made.
     """
 
     coefficient: float = 0.1
@@ -44,6 +46,7 @@ class RNDConfig:
     clip: float = 100.0
     warmup: int = 100
     forgetting: float = 0.0
+    relabel: bool = True
 
     def __post_init__(self) -> None:
         if self.capacity < self.batch_size or self.batch_size < 1 or self.width < 1:

@@ -140,6 +140,8 @@ def build_trainer(run: RunConfig) -> Trainer:
     """
     if run.threads is not None:
         torch.set_num_threads(run.threads)
+    # Saturated networks make numbers so small that a CPU computes with them many times slower.
+    torch.set_flush_denormal(True)
     torch.manual_seed(run.seed)
     np.random.seed(run.seed)  # some gymnasium environments draw from numpy's global generator
     envs = make_envs(run.env)

@@ -26,6 +26,7 @@ class SegmentReplay:
         num_envs: sub-environments that step together.
         capacity: transitions kept; rounded down to whole vector steps.
         device: where the ring lives.
+        with_bonus: whether a transition's exploration reward is stored with it, as judged when it was made.
     """
 
     def __init__(
@@ -36,8 +37,9 @@ class SegmentReplay:
         num_envs: int,
         capacity: int = 800_000,
         device: torch.device | str = "cpu",
+        with_bonus: bool = False,
     ) -> None:
-        self._widths = [obs_dim, obs_dim, action_dim, 1, latent_dim, 1, 1, 1]
+        self._widths = [obs_dim, obs_dim, action_dim, 1, latent_dim, int(with_bonus), 1, 1, 1]
         self._num_envs = num_envs
         self._rows = capacity // num_envs
         if self._rows < 2:
@@ -46,7 +48,7 @@ class SegmentReplay:
         self._head = 0  # next row to write
         self._filled = 0  # rows that hold data
         self._episode_step = torch.zeros(num_envs, 1, device=device)
-        self._ends = sum(self._widths[:6])  # column: did the episode end (either way) after this step
+        self._ends = sum(self._widths[:7])  # column: did the episode end (either way) after this step
 
     def __len__(self) -> int:
         """Transitions stored."""
@@ -61,12 +63,13 @@ class SegmentReplay:
         terminated: np.ndarray | Tensor,
         truncated: np.ndarray | Tensor,
         latent: Tensor,
+        bonus: Tensor | None = None,
     ) -> None:
-        """Store one vector step; every argument has ``num_envs`` rows.
+        """Store one vector step; every argument has ``num_envs`` rows; ``bonus`` only if it is to be stored.
 
         ``next_obs`` is the true successor, also where the episode ended (not the next reset).
         """
-        obs_dim, _, action_dim, _, latent_dim, *_ = self._widths
+        obs_dim, _, action_dim, _, latent_dim, bonus_dim, *_ = self._widths
         ended_now = self._matrix(terminated, 1, "terminated")
         ended = ended_now + self._matrix(truncated, 1, "truncated") > 0
         row = self._data[self._head]
@@ -77,6 +80,7 @@ class SegmentReplay:
                 self._matrix(action, action_dim, "action"),
                 self._matrix(reward, 1, "reward"),
                 self._matrix(latent, latent_dim, "latent"),
+                self._matrix(row[:, :0] if bonus is None else bonus, bonus_dim, "bonus"),
                 ended_now,
                 ended.to(row),
                 self._episode_step,
@@ -128,7 +132,7 @@ class SegmentReplay:
         # Steps outside the episode repeat its last transition, so no value from elsewhere can leak in.
         last = mask.sum(0, keepdim=True) - 1
         picked = picked.gather(0, torch.minimum(steps, last).unsqueeze(-1).expand_as(picked))
-        obs, next_obs, action, reward, latent, terminated, _, step = picked.split(self._widths, dim=-1)
+        obs, next_obs, action, reward, latent, bonus, terminated, _, step = picked.split(self._widths, dim=-1)
         return SegmentBatch(
             obs=obs[0],
             next_obs=next_obs,
@@ -138,6 +142,7 @@ class SegmentReplay:
             mask=mask.to(picked.dtype),
             latent=latent[0],
             step=step[0, :, 0],
+            bonus=bonus.squeeze(-1) if self._widths[5] else None,
         )
 
     def state_dict(self) -> dict[str, Any]:

@@ -12,6 +12,7 @@ import torch
 from gymnasium.vector import VectorEnv
 from torch import Tensor
 
+from rpg import compiling
 from rpg.agents.agent import Agent
 from rpg.envs.base import Restorable, Tracked
 from rpg.errors import NonFiniteError
@@ -73,6 +74,7 @@ class Trainer:
             envs.num_envs,
             config.replay_capacity,
             agent.device,
+            with_bonus=exploration is not None and not exploration.config.relabel,
         )
         self._tracker = envs.make_tracker() if isinstance(envs, Tracked) else None
         self.decisions = self.updates = self._ticks = 0
@@ -164,7 +166,10 @@ class Trainer:
     def collect_once(self) -> None:
         """Act once in every environment and store what happened."""
         transition, episodes = self._runner.step()
-        self._replay.add(*transition)
+        bonus = None
+        if self.exploration is not None and not self.exploration.config.relabel:
+            bonus = self.exploration.bonus(torch.as_tensor(transition.next_obs, device=self.agent.device))
+        self._replay.add(*transition, bonus)
         self._watch(transition.next_obs)
         if episodes:
             begun = np.logical_or(transition.terminated, transition.truncated)
@@ -193,7 +198,7 @@ class Trainer:
     def update_agent(self) -> None:
         """Sample segments, judge their novelty as it is now, and let the agent learn from them."""
         batch = self._replay.sample(self.agent.batch_size, self.agent.horizon)
-        if self.exploration is not None:
+        if self.exploration is not None and self.exploration.config.relabel:
             batch = self.exploration.relabel(batch)
         self._add(self.agent.update(batch, self.env_steps))
         self.updates += 1
@@ -225,6 +230,8 @@ class Trainer:
         elapsed = max(wall - self._speed[2], 1e-9)
         row["time/env_steps_per_s"] = (self.decisions - self._speed[0]) * self._repeat / elapsed
         row["time/updates_per_s"] = (self.updates - self._speed[1]) / elapsed
+        if compiling.LOG.seconds:
+            row["time/compile_s"] = round(sum(compiling.LOG.seconds.values()), 3)  # of this process
         self._speed = (self.decisions, self.updates, wall)
         self._sums, self._counts, self._episodes = {}, {}, []
         self._loggers.log(row, self.env_steps)

@@ -15,7 +15,7 @@ class WorldModelConfig:
     Args:
         state_dim: width of the latent state s.
         width: hidden width of every MLP and of the GRU.
-        dynamics: ``gru`` (published) or ``residual``, s' = s + f(s, a), which is a quarter of the work.
+        dynamics: ``gru`` (published) or ``residual``, s' = norm(s + f(s, a)), a quarter of its work.
         activation: of every MLP, policy and posterior included: ``elu`` (published), ``silu`` or ``relu``.
         critic: ``v`` composes Q(s, a, z) = r(s', a) + gamma V(s', z) as the published code does;
             ``q`` learns Q(s, a, z) directly as in Eq. 3.3.

@@ -98,6 +98,16 @@ def train(agent: RPG, steps: Iterator[SegmentBatch]) -> list[dict[str, Tensor]]:
     return [agent.update(batch, env_steps=5 * i) for i, batch in enumerate(steps)]
 
 
+def policy_step(agent: RPG, batch: SegmentBatch) -> dict[str, Tensor]:
+    fresh, noise = agent.sample_latent(batch.obs), agent._draw(agent.config.actor_horizon, len(batch.obs))
+    return agent._learn_policy(batch, fresh, noise)
+
+
+def model_step(agent: RPG, batch: SegmentBatch) -> dict[str, Tensor]:
+    noise = agent._draw(agent.config.target_horizon, batch.reward.numel())
+    return agent._learn_model(batch, batch.reward, noise)
+
+
 # -- determinism and persistence -----------------------------------------------------------------------
 
 
@@ -184,7 +194,7 @@ def test_target_moves_only_every_so_many_updates() -> None:
 def test_policy_step_leaves_the_world_model_alone() -> None:
     agent = make()
     before = snapshot(agent.state_dict())
-    agent._update_policy(next(batches(agent, 1)))
+    policy_step(agent, next(batches(agent, 1)))
     touched = {name.split("/")[1] for name in differences(before, agent.state_dict())}
     assert touched == {"policy", "policy_optimizer", "posterior", "aux_optimizer", "log_alpha"}
 
@@ -192,7 +202,7 @@ def test_policy_step_leaves_the_world_model_alone() -> None:
 def test_model_step_leaves_policy_and_posterior_alone() -> None:
     agent = make()
     before = snapshot(agent.state_dict())
-    agent._update_model(next(batches(agent, 1)), env_steps=0)
+    model_step(agent, next(batches(agent, 1)))
     touched = {name.split("/")[1] for name in differences(before, agent.state_dict())}
     assert touched == {"model", "model_optimizer"}
 
@@ -206,14 +216,14 @@ def test_policy_is_updated_every_so_many_model_updates() -> None:
 def test_policy_steps_climb_the_imagined_value() -> None:
     agent = make(replace(TINY, lr=3e-3, alpha=0.0, beta=0.0))
     batch = next(batches(agent, 1))
-    values = [float(agent._update_policy(batch)["train/policy_value"]) for _ in range(60)]
+    values = [float(policy_step(agent, batch)["train/policy_value"]) for _ in range(60)]
     assert np.mean(values[-10:]) > np.mean(values[:10]) + 0.1
 
 
 def test_posterior_steps_make_z_recognisable() -> None:
     agent = make(replace(TINY, latent=CATEGORIES, lr=3e-3, beta=1.0))
     batch = next(batches(agent, 1))._replace(step=torch.zeros(8))
-    losses = [float(agent._update_policy(batch)["loss/posterior"]) for _ in range(150)]
+    losses = [float(policy_step(agent, batch)["loss/posterior"]) for _ in range(150)]
     assert np.mean(losses[-10:]) < np.mean(losses[:10]) - 0.3
 
 
@@ -271,7 +281,7 @@ def test_policy_learns_with_the_z_that_acted_and_with_fresh_ones_at_first_steps(
         agent = make()
         batch = next(batches(agent, 1))._replace(step=torch.full((8,), step), latent=torch.full((8, 2), z))
         torch.manual_seed(3)
-        return float(agent._update_policy(batch)["train/policy_value"])
+        return float(policy_step(agent, batch)["train/policy_value"])
 
     assert value(step=0.0, z=1.0) == value(step=0.0, z=-1.0)
     assert value(step=1.0, z=1.0) != value(step=1.0, z=-1.0)
@@ -353,7 +363,7 @@ def drawn_noise(agent: RPG, n: int, steps: int) -> Tensor:
     """What replaced the standard normal in each action, (steps, n, action_dim), from one state and z."""
     obs, z = torch.zeros(n, 3), torch.zeros(n, agent.latent_dim)
     agent.begin_episodes(obs, torch.ones(n, dtype=torch.bool), z)
-    distribution = agent.policy(agent.model.encoder(agent._input(obs)), z)
+    distribution = agent.policy(agent.model.encode(agent._input(obs)), z)
     actions = torch.stack([agent.from_env(agent.act(obs, z)) for _ in range(steps)])
     return ((actions.atanh() - distribution.mean) / distribution.log_std.exp()).detach()
 

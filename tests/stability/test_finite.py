@@ -88,8 +88,7 @@ def alpha_after(updates: int, entropy_target: float) -> tuple[float, RPG]:
     """Entropy weight after chasing a target that no tanh-normal can reach (or can never fall below)."""
     agent = make_agent(entropy_target=entropy_target, max_alpha=2.0)
     # Faster than any setting we ship, so that few updates show what many would do.
-    for group in agent._aux_optimizer.param_groups:
-        group["lr"] = 0.1
+    agent._aux_optimizer.lr = 0.1
     for _ in range(updates):
         agent.update(batch(agent, "ordinary"))
     return float(agent.alpha), agent

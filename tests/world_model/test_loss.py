@@ -56,7 +56,7 @@ def test_steps_of_the_episode_count(name: str, term: str) -> None:
 def test_terms_match_a_hand_computed_case() -> None:
     still = model()
     with torch.no_grad():
-        for net in (still.readout, still.reward_head):
+        for net in (still.dynamics.out, still.reward_head):
             net[-1].weight.zero_()
         still.value_heads.w3.zero_()
     recorded = inputs() | {
@@ -84,7 +84,7 @@ def test_action_values_are_taken_where_the_action_was_chosen() -> None:
     recorded["mask"] = torch.zeros(K, N).index_fill(0, torch.tensor([0]), 1.0)
     before = model_losses(net, **recorded).value
     with torch.no_grad():
-        net.readout[-1].bias += 1.0
+        net.dynamics.out[-1].bias += 1.0
     assert model_losses(net, **recorded).value == before
 
 

@@ -123,4 +123,4 @@ def test_target_states_are_the_target_encoding_of_what_followed() -> None:
     batch = segments(torch.zeros(2, 3))
     states, _ = agent._targets(batch, batch.reward)
     for k in range(2):
-        torch.testing.assert_close(states[k], agent.target.encoder(agent._input(batch.next_obs[k])))
+        torch.testing.assert_close(states[k], agent.target.encode(agent._input(batch.next_obs[k])))

@@ -1,0 +1,164 @@
+"""Compiled regions do what the plain functions do, compile once, and are not needed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+
+from rpg import compiling
+from rpg.agents import RPG, RPGConfig, WorldModelConfig
+from rpg.exploration import ObjectsOfInterest, RandomNetworkDistillation, RNDConfig
+from rpg.segments import SegmentBatch
+
+CPU = torch.device("cpu")
+needs_compiler = pytest.mark.skipif(compiling.compiler_missing(CPU) is not None, reason="no C++ compiler")
+BATCH = 8
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path_factory.getbasetemp() / "compiled"))
+    yield
+    torch._dynamo.reset()
+
+
+def make_agent(**changes: Any) -> RPG:
+    torch.manual_seed(0)
+    model = WorldModelConfig(
+        state_dim=8, width=16, dynamics=changes.pop("dynamics", "gru"), activation="silu"
+    )
+    config = RPGConfig(world_model=model, width=16, batch_size=BATCH, entropy_target=0.0, **changes)
+    observations = gym.spaces.Box(-1.0, 1.0, (3,), np.float32)
+    actions = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
+    return RPG(observations, actions, config, ObjectsOfInterest.of((0, 1)))
+
+
+def make_density() -> RandomNetworkDistillation:
+    torch.manual_seed(1)
+    config = RNDConfig(width=16, batch_size=32, capacity=500, warmup=3, forgetting=0.01)
+    density = RandomNetworkDistillation(ObjectsOfInterest.of((0, 1)), config)
+    density.observe(torch.rand(400, 3))
+    return density
+
+
+def batches(agent: RPG, n: int) -> Iterator[SegmentBatch]:
+    generator = torch.Generator().manual_seed(2)
+
+    def uniform(*shape: int) -> torch.Tensor:
+        return torch.rand(*shape, generator=generator)
+
+    for _ in range(n):
+        yield SegmentBatch(
+            obs=uniform(BATCH, 3),
+            next_obs=uniform(3, BATCH, 3),
+            action=2 * uniform(3, BATCH, 2) - 1,
+            reward=uniform(3, BATCH),
+            terminated=(uniform(3, BATCH) < 0.2).float(),
+            mask=(uniform(3, BATCH) < 0.8).float().cumprod(0),
+            latent=uniform(BATCH, agent.latent_dim),
+            step=(4 * uniform(BATCH)).floor(),
+        )
+
+
+def learn(agent: RPG, density: RandomNetworkDistillation, steps: list[SegmentBatch]) -> list[dict[str, Any]]:
+    """What a trainer does at every tick, noise included."""
+    rows = []
+    for i, batch in enumerate(steps):
+        torch.manual_seed(i)
+        row = density.update()
+        relabelled = density.relabel(batch)
+        row = row | {"bonus": relabelled.bonus} | agent.update(relabelled, env_steps=i)
+        row["action"] = agent.act(batch.obs, batch.latent)
+        rows.append(row)
+    return rows
+
+
+def vectors(agent: RPG, density: RandomNetworkDistillation) -> dict[str, torch.Tensor]:
+    return {
+        "model": agent._model_optimizer.vector,
+        "model moments": agent._model_optimizer.mean,
+        "target": agent._target_vector.vector,
+        "policy": agent._policy_optimizer.vector,
+        "auxiliary": agent._aux_optimizer.vector,
+        "density": density._optimizer.vector,
+        "normaliser": density._normalizer.stats.float(),
+    }
+
+
+@needs_compiler
+@pytest.mark.timeout(600)  # a cold cache: half a minute for each of five regions on a busy core
+@pytest.mark.parametrize("dynamics", ["gru", "residual"])
+def test_compiled_and_plain_learn_the_same_and_nothing_compiles_twice(dynamics: str) -> None:
+    plain, compiled = make_agent(dynamics=dynamics), make_agent(dynamics=dynamics)
+    plain_density, density = make_density(), make_density()
+    compiled.compile()
+    density.compile()
+    steps = list(batches(plain, 40))
+    expected = learn(plain, plain_density, steps)
+    got = learn(compiled, density, steps[:2])  # one update with and one without the policy
+    with torch.compiler.set_stance("fail_on_recompile"):
+        for i, batch in enumerate(steps[2:], start=2):
+            torch.manual_seed(i)
+            row = density.update()
+            relabelled = density.relabel(batch)
+            row = row | {"bonus": relabelled.bonus} | compiled.update(relabelled, env_steps=i)
+            row["action"] = compiled.act(batch.obs, batch.latent)
+            got.append(row)
+    for i, (a, b) in enumerate(zip(expected, got, strict=True)):
+        assert a.keys() == b.keys()
+        for key in a:
+            torch.testing.assert_close(b[key], a[key], rtol=2e-3, atol=2e-4, msg=f"{key} at update {i}")
+    ours = vectors(compiled, density)
+    for name, vector in vectors(plain, plain_density).items():
+        torch.testing.assert_close(ours[name], vector, rtol=2e-3, atol=2e-4, msg=name)
+
+
+@needs_compiler
+@pytest.mark.timeout(600)
+def test_first_gradients_agree_to_rounding() -> None:
+    plain, compiled = make_agent(), make_agent()
+    compiled.compile()
+    batch = next(batches(plain, 1))
+    for agent in (plain, compiled):
+        torch.manual_seed(3)
+        agent.update(batch)
+    for name in ("_model_optimizer", "_policy_optimizer", "_aux_optimizer"):
+        # After one step of Adam the first moment is a tenth of the (clipped) gradient.
+        torch.testing.assert_close(
+            getattr(compiled, name).mean, getattr(plain, name).mean, rtol=1e-4, atol=1e-7, msg=name
+        )
+
+
+@needs_compiler
+@pytest.mark.timeout(600)
+def test_compile_time_is_recorded() -> None:
+    compiling.LOG.seconds.clear()
+    density = make_density()
+    density.compile()
+    density.update()
+    assert compiling.LOG.seconds["density"] > 0
+    assert "bonus" not in compiling.LOG.seconds
+
+
+def test_without_a_compiler_the_reason_is_given(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("CXX", raising=False)
+    monkeypatch.setattr(compiling.shutil, "which", lambda name: None)
+    assert "C++" in str(compiling.compiler_missing(CPU))
+
+
+@pytest.mark.timeout(600)
+def test_a_region_that_cannot_be_compiled_runs_plainly_and_says_so() -> None:
+    def unfit(x: torch.Tensor) -> torch.Tensor:
+        torch._dynamo.graph_break()
+        return x + 1
+
+    region = compiling.compile_region(unfit, "unfit", CPU)
+    with pytest.warns(UserWarning, match="unfit: not compiled, runs eagerly"):
+        assert float(region(torch.zeros(()))) == 1.0
+    assert float(region(torch.ones(()))) == 2.0  # and stays quiet
+    assert "unfit" in compiling.LOG.failed
