@@ -70,7 +70,8 @@ def compile_region(function: Callable[P, R], name: str, device: torch.device) ->
     processes.
 
     Args:
-        function: tensors in, tensors out; draws no random numbers of its own.
+        function: tensors in, tensors out; draws no random numbers of its own. Settings that it reads are
+            fixed at the first call.
         name: for :data:`LOG` and messages.
         device: that all tensors live on.
     """
@@ -78,8 +79,12 @@ def compile_region(function: Callable[P, R], name: str, device: torch.device) ->
     import torch._dynamo  # takes a second; nothing else here needs it
 
     torch._dynamo.config.trace_autograd_ops = True  # autograd.grad inside a region
-    mode = "reduce-overhead" if device.type == "cuda" else "default"
-    compiled: Callable[P, R] = torch.compile(function, fullgraph=True, dynamic=False, mode=mode)
+    options: dict[str, Any] = {
+        # A region checks the tensors it is given and takes the rest, hundreds of settings, as they were.
+        "guard_filter_fn": torch.compiler.keep_tensor_guards_unsafe,
+        "triton.cudagraphs": device.type == "cuda",
+    }
+    compiled: Callable[P, R] = torch.compile(function, fullgraph=True, dynamic=False, options=options)
     chosen: list[Callable[P, R]] = []
 
     def region(*args: P.args, **kwargs: P.kwargs) -> R:

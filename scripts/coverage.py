@@ -44,10 +44,10 @@ _PUBLISHED = (
 )  # fmt: skip
 
 VARIANTS = {
-    "rpg": Variant("rpg", "gaussian12"),
+    "rpg": Variant("rpg", "gaussian12", steps=240_000, seeds=(0, 1, 2, 3, 4)),
     "mbsac": Variant("mbsac", "none"),
     "rpg-categorical": Variant(
-        "rpg", "categorical12", ("agent.latent.gaussian=0", "agent.latent.categories=12"), seeds=(0,)
+        "rpg", "categorical12", ("agent.latent.gaussian=0", "agent.latent.categories=12")
     ),
     # What made the difference: one published choice put back at a time, then all of them.
     "white-noise": Variant("rpg", "gaussian12", ("agent.noise_correlation=0",), steps=20_000, seeds=(0,)),
@@ -77,14 +77,14 @@ VARIANTS = {
 }
 
 
-def job(name: str, seed: int) -> Job:
+def job(name: str, seed: int, threads: int = 1) -> Job:
     """One run of a variant."""
     variant = VARIANTS[name]
     overrides = (
         f"agent={variant.agent}", "env=maze", f"size={variant.preset}", f"seed={seed}",
         f"trainer.steps={variant.steps}", *variant.overrides,
     )  # fmt: skip
-    return Job(f"{name} seed {seed}", _RUNS / name / f"seed{seed}", overrides)
+    return Job(f"{name} seed {seed}", _RUNS / name / f"seed{seed}", overrides, threads)
 
 
 def run(names: list[str], jobs: int, seeds: list[int] | None) -> int:

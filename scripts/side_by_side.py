@@ -19,12 +19,13 @@ class Job:
     name: str
     folder: Path
     overrides: tuple[str, ...]
+    threads: int = 1
 
     @property
     def command(self) -> list[str]:
-        """The `rpg-train` command: one thread, files alone, no evaluations."""
+        """The `rpg-train` command: files alone, no evaluations."""
         return [
-            sys.executable, "-m", "rpg.train", *self.overrides, "threads=1", "logger=files",
+            sys.executable, "-m", "rpg.train", *self.overrides, f"threads={self.threads}", "logger=files",
             "trainer.eval_every=0", f"run_dir={self.folder}",
         ]  # fmt: skip
 

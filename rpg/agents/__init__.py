@@ -1,9 +1,18 @@
 """Agents. Importing this package loads torch and gymnasium, and no simulator, Hydra or wandb."""
 
 from rpg.agents.agent import Agent
-from rpg.agents.config import PriorConfig, RewardRamp, RPGConfig
+from rpg.agents.config import EntropyDecay, PriorConfig, RewardRamp, RPGConfig
 from rpg.agents.rpg import RPG
 from rpg.policies.latent import LatentConfig
 from rpg.world_model.config import WorldModelConfig
 
-__all__ = ["RPG", "Agent", "LatentConfig", "PriorConfig", "RPGConfig", "RewardRamp", "WorldModelConfig"]
+__all__ = [
+    "RPG",
+    "Agent",
+    "EntropyDecay",
+    "LatentConfig",
+    "PriorConfig",
+    "RPGConfig",
+    "RewardRamp",
+    "WorldModelConfig",
+]

@@ -81,6 +81,30 @@ class RewardRamp:
         return rise + min(max(finish, 0.0), 1.0) * (1.0 - self.level)
 
 
+@dataclass
+class EntropyDecay:
+    """Schedule of the entropy target: broad behaviour while little is known, sharp to get far later.
+
+    The target falls linearly from ``entropy_target`` at ``start`` env steps to ``to`` at ``end``. ``to=None``
+    keeps it constant, as published.
+    """
+
+    to: float | None = None
+    start: float = 0.0
+    end: float = 100_000.0
+
+    def __post_init__(self) -> None:
+        if self.to is not None and not 0 <= self.start < self.end:
+            raise RPGError(f"agent.entropy_decay: need 0 <= start={self.start} < end={self.end}")
+
+    def target_at(self, first: float, env_steps: int) -> float:
+        """The target after ``env_steps``, having begun at ``first``."""
+        if self.to is None:
+            return first
+        progress = (env_steps - self.start) / (self.end - self.start)
+        return first + min(max(progress, 0.0), 1.0) * (self.to - first)
+
+
 _COUNTS = ("batch_size", "width", "actor_every", "actor_horizon", "target_horizon")
 _NOT_NEGATIVE = ("alpha", "beta", "horizon_decay", "observation_frequencies")
 _POSITIVE = ("lr", "grad_clip", "base_std", "max_alpha")
@@ -113,6 +137,7 @@ class RPGConfig:
         alpha: initial entropy weight.
         tune_alpha: adapt alpha to the entropy target.
         entropy_target: in nats; None for -|A|.
+        entropy_decay: optional schedule of that target.
         max_alpha: upper bound that a tuned alpha cannot leave.
         beta: weight of log p_phi(z|s, a).
         tune_beta: adapt beta until log p_phi reaches ``consistency_target``.
@@ -143,6 +168,7 @@ class RPGConfig:
     alpha: float = 0.01
     tune_alpha: bool = True
     entropy_target: float | None = None
+    entropy_decay: EntropyDecay = field(default_factory=EntropyDecay)
     max_alpha: float = 10.0
     beta: float = 0.005
     tune_beta: bool = False

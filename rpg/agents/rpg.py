@@ -184,7 +184,10 @@ class RPG(Agent):
         if self._updates % cfg.actor_every == 0:
             n = len(batch.obs)
             fresh = self.prior.sample(n, self._encoded(batch.obs) if self.prior.learned else None)
-            metrics = metrics | self._policy_region(batch, fresh, self._draw(cfg.actor_horizon, n))
+            first = -float(self.action_dim) if cfg.entropy_target is None else cfg.entropy_target
+            entropy = torch.tensor(cfg.entropy_decay.target_at(first, env_steps), device=self.device)
+            noise = self._draw(cfg.actor_horizon, n)
+            metrics = metrics | self._policy_region(batch, fresh, noise, entropy)
         if self.prior.learned and self._updates % cfg.prior.every == 0:
             with self._autocast():
                 metrics = metrics | self.prior.update(self._value_of_starts, env_steps)
@@ -264,7 +267,9 @@ class RPG(Agent):
         after = estimate.min(0).values.view(steps, n) * (1.0 - batch.terminated)
         return states, (after if self.model.critic == "v" else reward + cfg.gamma * after).float()
 
-    def _learn_policy(self, batch: SegmentBatch, fresh: Tensor, noise: Tensor) -> Metrics:
+    def _learn_policy(
+        self, batch: SegmentBatch, fresh: Tensor, noise: Tensor, entropy_target: Tensor
+    ) -> Metrics:
         """Climb Eq. 3.3 in pi(a|s, z), fit the posterior, adapt alpha and beta.
 
         ``fresh`` (N, latent_dim) are newly drawn z: at an episode's first step z is still free.
@@ -281,7 +286,7 @@ class RPG(Agent):
             "train/entropy": -imagined.log_pi.detach().mean(),
             "train/alpha": self.alpha,
         }
-        return metrics | self._learn_auxiliary(imagined, latent)
+        return metrics | self._learn_auxiliary(imagined, latent, entropy_target)
 
     def _policy_terms(
         self, batch: SegmentBatch, fresh: Tensor, noise: Tensor
@@ -296,7 +301,7 @@ class RPG(Agent):
         value = {"first": estimate[0], "mean": estimate.mean(0), "min": estimate.min(0).values}
         return value[cfg.actor_value], imagined, latent
 
-    def _learn_auxiliary(self, imagined: Imagined, latent: Tensor) -> Metrics:
+    def _learn_auxiliary(self, imagined: Imagined, latent: Tensor, entropy_target: Tensor) -> Metrics:
         """Maximum likelihood for p_phi(z|s, a) on imagined steps, and the two coefficients."""
         cfg, optimizer = self.config, self._aux_optimizer
         metrics: Metrics = {}
@@ -311,9 +316,8 @@ class RPG(Agent):
         log_alpha = optimizer.part("log_alpha")
         tune_alpha = cfg.tune_alpha and cfg.alpha > 0
         if tune_alpha:
-            target = -float(self.action_dim) if cfg.entropy_target is None else cfg.entropy_target
             # alpha rises while the entropy is below its target.
-            gap = imagined.log_pi.detach().mean() + target
+            gap = imagined.log_pi.detach().mean() + entropy_target
             terms.append(-optimizer.vector[log_alpha].sum() * gap)
         if terms:
             (grad,) = torch.autograd.grad(sum(terms[1:], terms[0]), [optimizer.vector])

@@ -100,7 +100,8 @@ def train(agent: RPG, steps: Iterator[SegmentBatch]) -> list[dict[str, Tensor]]:
 
 def policy_step(agent: RPG, batch: SegmentBatch) -> dict[str, Tensor]:
     fresh, noise = agent.sample_latent(batch.obs), agent._draw(agent.config.actor_horizon, len(batch.obs))
-    return agent._learn_policy(batch, fresh, noise)
+    target = agent.config.entropy_target
+    return agent._learn_policy(batch, fresh, noise, torch.tensor(-2.0 if target is None else target))
 
 
 def model_step(agent: RPG, batch: SegmentBatch) -> dict[str, Tensor]:
