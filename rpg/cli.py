@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shlex
+import shutil
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,13 +12,19 @@ from pathlib import Path
 from typing import Any
 
 from hydra import compose, initialize_config_module
+from hydra.core.config_store import ConfigStore
+from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
+from hydra.core.plugins import Plugins
 from hydra.errors import HydraException
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from rpg.errors import RPGError, nearest
+
+INTERRUPTED = 130  # exit code after Ctrl-C
 
 _CONF = Path(__file__).parent / "conf"
 _NOT_IN_FOLDER = (
@@ -32,6 +39,16 @@ _NOT_IN_FOLDER = (
     "trainer.checkpoint_every",
 )
 
+# Launchers of plugins, and ours that build on them: the plugin's own name, its package, and our extra.
+_LAUNCHERS = {
+    "joblib": ("joblib", "hydra-joblib-launcher", "joblib"),
+    "slurm": ("submitit_slurm", "hydra-submitit-launcher", "slurm"),
+    "submitit_slurm": ("submitit_slurm", "hydra-submitit-launcher", "slurm"),
+    "submitit_local": ("submitit_local", "hydra-submitit-launcher", "slurm"),
+    "ray": ("ray", "hydra-ray-launcher", "ray"),
+    "ray_cluster": ("ray", "hydra-ray-launcher", "ray"),
+}
+
 
 @contextmanager
 def report_errors() -> Iterator[None]:
@@ -42,11 +59,29 @@ def report_errors() -> Iterator[None]:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from error
     except KeyboardInterrupt:
-        raise SystemExit(130) from None
+        raise SystemExit(INTERRUPTED) from None
+
+
+def is_sweep(args: list[str]) -> bool:
+    """Whether these arguments ask for a sweep."""
+    return bool({"-m", "--multirun"} & set(args))
+
+
+def brings_configs(args: list[str]) -> bool:
+    """Whether these arguments name configs other than ours."""
+    flags = {"--config-dir", "-cd", "--config-name", "-cn", "--config-path", "-cp"}
+    return bool(flags & {a.split("=")[0] for a in args})
+
+
+def in_sweep() -> bool:
+    """Whether this code runs as a job of a sweep."""
+    return HydraConfig.initialized() and HydraConfig.get().mode is RunMode.MULTIRUN
 
 
 def command_line() -> str:
-    """The command that started this process, ready to be pasted."""
+    """The command that starts this run again, ready to be pasted; of a sweep, this run alone."""
+    if in_sweep():
+        return shlex.join(["rpg-train", *HydraConfig.get().overrides.task])
     return shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
 
 
@@ -58,17 +93,7 @@ def check_overrides(args: list[str]) -> None:
     """
     texts = [a for a in args if not a.startswith("-") and "=" in a]
     stray = [a for a in args if not a.startswith("-") and "=" not in a and not a.startswith("~")]
-    flags_with_value = {
-        "--config-dir",
-        "-cd",
-        "--config-name",
-        "-cn",
-        "--config-path",
-        "-cp",
-        "--package",
-        "-p",
-    }
-    if flags_with_value & {a.split("=")[0] for a in args} or "--info" in args:
+    if brings_configs(args) or {"--package", "-p", "--info"} & {a.split("=")[0] for a in args}:
         return  # the user brings configs of their own, or asks Hydra about itself
     if stray and "--cfg" not in args and "-c" not in args:
         raise RPGError(f"'{stray[0]}': overrides look like key=value, for instance agent=rpg")
@@ -78,15 +103,18 @@ def check_overrides(args: list[str]) -> None:
         raise RPGError(f"override: {str(error).strip().splitlines()[0]}") from error
     groups = {
         p.relative_to(_CONF).as_posix() for p in _CONF.rglob("*") if p.is_dir() and p.name != "__pycache__"
-    }
+    } - {"hydra", "hydra/launcher"}
+    for override in overrides:
+        if override.key_or_group == "hydra/launcher":
+            _check_launcher(str(_values(override)[0]), is_sweep(args))
     chosen = [o for o in overrides if o.key_or_group in groups]
     _check_options(chosen)
     sweeps = [text for override, text in zip(overrides, texts, strict=True) if override.is_sweep_override()]
-    if sweeps and not {"-m", "--multirun"} & set(args):
+    if sweeps and not is_sweep(args):
         raise RPGError(f"{sweeps[0]}: several values make a sweep; add -m, or quote a list as [a,b]")
     base = _compose([f"{o.key_or_group}={_values(o)[0]}" for o in chosen])
     for override in overrides:
-        if override.key_or_group in groups or override.key_or_group.split(".")[0] == "hydra":
+        if override.key_or_group in groups or override.is_hydra_override():
             continue
         if not (override.is_add() or override.is_force_add()):
             _require_key(base, override.key_or_group, groups)
@@ -97,7 +125,9 @@ def check_overrides(args: list[str]) -> None:
     cfg = _compose([*single, *removed])
     # Hydra names the folder after the overrides of our keys, not after its own.
     named = ",".join(
-        text for text in texts if text.split("=")[0] not in _NOT_IN_FOLDER and not text.startswith("hydra.")
+        text
+        for override, text in zip(overrides, texts, strict=True)
+        if text.split("=")[0] not in _NOT_IN_FOLDER and not override.is_hydra_override()
     )
     if len(named) > 200 and not any(text.startswith("run_dir=") for text in texts):
         raise RPGError("too many overrides to name the run folder after them; add run_dir=runs/my_run")
@@ -112,6 +142,27 @@ def _check_options(chosen: list[Override]) -> None:
         for value in _values(override):
             if str(value) not in options:
                 raise RPGError(f"{override.key_or_group}={value}: unknown; {nearest(str(value), options)}")
+
+
+def _check_launcher(name: str, sweeps: bool) -> None:
+    """Refuse a launcher that is unknown, whose plugin is missing, or that has no sweep to launch."""
+    Plugins.instance()  # finds what is installed
+    installed = {option.removesuffix(".yaml") for option in ConfigStore.instance().list("hydra/launcher")}
+    known = installed | _LAUNCHERS.keys()
+    if name not in known:
+        raise RPGError(f"hydra/launcher={name}: unknown; {nearest(name, known)}")
+    plugin, package, extra = _LAUNCHERS.get(name, (name, "", ""))
+    if plugin not in installed:
+        raise RPGError(
+            f"hydra/launcher={name} needs the package '{package}': pip install -e '.[{extra}]' in a checkout, "
+            f"or pip install {package}"
+        )
+    if not sweeps:
+        raise RPGError(f"hydra/launcher={name}: launchers are for sweeps; add -m")
+    if plugin == "submitit_slurm" and shutil.which("srun") is None:
+        raise RPGError(
+            f"hydra/launcher={name}: no Slurm here; submit from a machine that has 'srun', or try submitit_local"
+        )
 
 
 def _require_folder(path: Path) -> None:

@@ -63,6 +63,13 @@ def compiler_missing(device: torch.device) -> str | None:
     return f"no compiler for {device.type}"
 
 
+def _load_compiler() -> None:
+    os.environ.setdefault(_CACHE, str(Path.home() / ".cache" / "rpg" / "compiled"))
+    import torch._dynamo  # takes a second, and settles where artefacts go
+
+    torch._dynamo.config.trace_autograd_ops = True  # autograd.grad inside a region
+
+
 def compile_region(function: Callable[P, R], name: str, device: torch.device) -> Callable[P, R]:
     """``function`` compiled for fixed shapes; on a GPU recorded as a CUDA graph.
 
@@ -75,10 +82,7 @@ def compile_region(function: Callable[P, R], name: str, device: torch.device) ->
         name: for :data:`LOG` and messages.
         device: that all tensors live on.
     """
-    os.environ.setdefault(_CACHE, str(Path.home() / ".cache" / "rpg" / "compiled"))
-    import torch._dynamo  # takes a second; nothing else here needs it
-
-    torch._dynamo.config.trace_autograd_ops = True  # autograd.grad inside a region
+    _load_compiler()
     options: dict[str, Any] = {
         # A region checks the tensors it is given and takes the rest, hundreds of settings, as they were.
         "guard_filter_fn": torch.compiler.keep_tensor_guards_unsafe,
@@ -107,7 +111,6 @@ def compile_region(function: Callable[P, R], name: str, device: torch.device) ->
 
 def keep_address(*tensors: Any) -> None:
     """Tell the compiler that these tensors are updated in place and never replaced (needed by CUDA graphs)."""
-    import torch._dynamo
-
+    _load_compiler()
     for tensor in tensors:
         torch._dynamo.mark_static_address(tensor)

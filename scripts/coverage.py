@@ -39,8 +39,9 @@ class Variant:
 
 
 _PUBLISHED = (
-    "env.tuning.entropy_target=null", "env.tuning.noise_correlation=0", "env.tuning.bonus=0.1",
-    "env.tuning.forgetting=0", "size.target_rate=0.005", "size.target_every=2", "size.lr=3e-4", "size.rnd_lr=3e-4",
+    "env.tuning.alpha=0.01", "env.tuning.gamma=0.99", "env.tuning.entropy_target=null", "env.tuning.entropy_final=null",
+    "env.tuning.noise_correlation=0", "env.tuning.bonus=0.1", "env.tuning.forgetting=0", "size.target_rate=0.005",
+    "size.target_every=2", "size.lr=3e-4", "size.rnd_lr=3e-4", "size.dynamics=gru", "size.decisions_per_update=5",
 )  # fmt: skip
 
 VARIANTS = {
@@ -51,7 +52,13 @@ VARIANTS = {
     ),
     # What made the difference: one published choice put back at a time, then all of them.
     "white-noise": Variant("rpg", "gaussian12", ("agent.noise_correlation=0",), steps=20_000, seeds=(0,)),
-    "low-entropy": Variant("rpg", "gaussian12", ("agent.entropy_target=-2",), steps=20_000, seeds=(0,)),
+    "low-entropy": Variant(
+        "rpg",
+        "gaussian12",
+        ("agent.entropy_target=-2", "agent.entropy_decay.to=null"),
+        steps=20_000,
+        seeds=(0,),
+    ),
     "small-bonus": Variant(
         "rpg",
         "gaussian12",
@@ -63,6 +70,9 @@ VARIANTS = {
         "rpg", "gaussian12", ("size.target_rate=0.005", "size.target_every=2"), steps=20_000, seeds=(0,)
     ),
     "published-tuning": Variant("rpg", "gaussian12", _PUBLISHED, steps=20_000, seeds=(0,)),
+    "constant-entropy": Variant("rpg", "gaussian12", ("agent.entropy_decay.to=null",), seeds=(0,)),
+    "far-sighted": Variant("rpg", "gaussian12", ("agent.gamma=0.99",), seeds=(0,)),
+    "gru": Variant("rpg", "gaussian12", ("size.dynamics=gru",), seeds=(0,)),
     # What the smaller batch and width cost.
     "paper-size": Variant(
         "rpg", "gaussian12", ("size.target_rate=0.03", "size.target_every=1"), "paper", 10_000, (0,)

@@ -19,11 +19,12 @@ from pathlib import Path
 import numpy as np
 from hydra import compose, initialize_config_module
 
+from rpg import compiling
 from rpg.cli import report_errors
 from rpg.errors import RPGError
 from rpg.train import assemble
 
-_LIMIT_S = 235.0  # a slower machine stops here and is judged at the step it reached
+_LIMIT_S = 235.0  # of training, compiling not counted; a slower machine is judged at the step it reached
 _RUN = Path("runs/demo")
 _PUBLISHED = Path(__file__).parent.parent / "results" / "published" / "maze_coverage.csv"
 
@@ -48,7 +49,9 @@ def main() -> int:
         start = time.perf_counter()
         with closing(trainer), progress:
             row = trainer.train(
-                should_stop=lambda: time.perf_counter() - start > _LIMIT_S,
+                should_stop=lambda: (
+                    time.perf_counter() - start > _LIMIT_S + sum(compiling.LOG.seconds.values())
+                ),
                 on_row=lambda row: progress.update(
                     int(row["env_steps"]), int(row["updates"]), {"train/coverage": row["train/coverage"]}
                 ),
@@ -64,6 +67,7 @@ def main() -> int:
             "decisions": trainer.decisions,
             "updates": trainer.updates,
             "wall_s": round(trainer.wall_s, 1),
+            "compile_s": round(sum(compiling.LOG.seconds.values()), 1),
             "seed": int(cfg.seed),
         }
         (_RUN / "verdict.json").write_text(json.dumps(verdict, indent=2) + "\n")

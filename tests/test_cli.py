@@ -196,7 +196,7 @@ def test_a_foreign_or_damaged_run_folder_is_refused_and_kept(
 def test_evaluate_judges_a_run_reproducibly(
     composed: Composed, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    train(composed(*TINY, "+env.kwargs.goal=[0.0,0.0]", "+env.kwargs.goal_radius=3.0"))
+    train(composed(*TINY, "+env.kwargs.goal=[0.0,0.0]", "+env.kwargs.goal_radius=0.8"))
     printed = []
     for seed in ("7", "7", "8"):
         capsys.readouterr()

@@ -5,14 +5,17 @@ from __future__ import annotations
 import csv
 import json
 import os
+import runpy
 import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[1]
 TINY = [
     "size.batch_size=16", "size.width=16", "size.state_dim=8", "size.rnd_width=16", "size.rnd_batch_size=16",
-    "trainer.log_every=200", "logger=files", "threads=1",
+    "trainer.log_every=200", "logger=files", "threads=1", "compile=false",
 ]  # fmt: skip
 
 
@@ -51,3 +54,35 @@ def test_coverage_runs_are_gathered_with_their_origin(tmp_path: Path) -> None:
     assert {row["updates"] for row in rows} == {"0"}
     assert all(row["commit"] for row in rows)
     assert 0 < float(rows[0]["coverage"]) <= float(rows[1]["coverage"]) <= 1
+
+
+def write_progress(folder: Path, coverage: list[float]) -> None:
+    folder.mkdir(parents=True)
+    rows = [f"{1000 * i},{250 * i},{3.0 * i},{value},2.5" for i, value in enumerate(coverage, start=1)]
+    header = "env_steps,updates,wall_s,train/coverage,time/compile_s"
+    (folder / "progress.csv").write_text("\n".join([header, *rows]) + "\n")
+
+
+def test_time_to_coverage_is_read_at_the_first_row_that_reaches_the_goal(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "scripts"))
+    module = runpy.run_path(str(ROOT / "scripts" / "time_to_coverage.py"))
+    write_progress(tmp_path / "run", [0.3, 0.91, 0.93, 0.95])
+    assert module["first_at"](tmp_path / "run", 0.92)["wall_s"] == "9.0"
+    assert module["last_row"](tmp_path / "run")["env_steps"] == "4000"
+    assert module["first_at"](tmp_path / "run", 0.99) == {}
+    assert module["last_row"](tmp_path / "elsewhere") == {}
+
+
+def test_time_to_coverage_refuses_a_run_that_was_started_before(tmp_path: Path) -> None:
+    folder = tmp_path / "runs" / "coverage" / "rpg" / "seed0"
+    folder.mkdir(parents=True)
+    (folder / "checkpoint.pt").write_bytes(b"")
+    done = subprocess.run(
+        [sys.executable, str(ROOT / "scripts" / "time_to_coverage.py"), "--seeds", "0"],
+        cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode != 0
+    assert "was started before" in done.stderr
+    assert not (tmp_path / "results").exists()

@@ -12,7 +12,7 @@ import torch
 from gymnasium.spaces import Box
 from torch import Tensor
 
-from rpg.agents import RPG, LatentConfig, PriorConfig, RewardRamp, RPGConfig, WorldModelConfig
+from rpg.agents import RPG, EntropyDecay, LatentConfig, PriorConfig, RewardRamp, RPGConfig, WorldModelConfig
 from rpg.agents.prior import LatentPrior
 from rpg.errors import RPGError
 from rpg.policies import make_latent_space
@@ -243,6 +243,30 @@ def test_alpha_stays_where_it_is_unless_tuned_and_below_its_bound() -> None:
     bounded = make(replace(TINY, entropy_target=100.0, max_alpha=0.0101, lr=0.1))
     train(bounded, batches(bounded, 5))
     assert float(bounded.alpha) == pytest.approx(0.0101)
+
+
+def test_entropy_target_falls_between_two_env_steps() -> None:
+    decay = EntropyDecay(to=-1.0, start=100.0, end=300.0)
+    assert [decay.target_at(0.5, step) for step in (0, 100, 200, 300, 900)] == [0.5, 0.5, -0.25, -1.0, -1.0]
+    assert EntropyDecay().target_at(0.5, 10**9) == 0.5
+
+
+def test_alpha_follows_the_entropy_target_of_the_env_step() -> None:
+    entropy = float(train(agent := make(), batches(agent, 1))[0]["train/entropy"])
+    decay = EntropyDecay(to=entropy - 5.0, start=0.0, end=100.0)
+
+    def alpha_at(env_steps: int) -> float:
+        learner = make(replace(TINY, entropy_target=entropy + 5.0, entropy_decay=decay))
+        for batch in batches(learner, 10):
+            learner.update(batch, env_steps)
+        return float(learner.alpha)
+
+    assert alpha_at(0) > TINY.alpha > alpha_at(100)
+
+
+def test_entropy_decay_that_ends_before_it_starts_is_refused() -> None:
+    with pytest.raises(RPGError, match="entropy_decay"):
+        EntropyDecay(to=0.0, start=5.0, end=5.0)
 
 
 def test_reward_is_scaled_and_ramped_and_the_bonus_is_not() -> None:

@@ -1,4 +1,6 @@
-"""Long stability runs leave what they measured in results/stability/<test>.json."""
+"""Long stability runs: their settings in the maze, and results/stability/<test>.json, where they leave what they
+measured.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +8,8 @@ import json
 import time
 from pathlib import Path
 from typing import Any
+
+from omegaconf import DictConfig
 
 from rpg.provenance import commit
 
@@ -33,3 +37,12 @@ def record(
     )
     _FOLDER.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(rows, indent=1) + "\n")
+
+
+def maze_config(folder: Path, steps: int, *overrides: str) -> DictConfig:
+    """The config of a run in the maze as the command line makes it, without evaluations."""
+    from hydra import compose, initialize_config_module
+
+    quiet = ["trainer.eval_every=0", "logger=files", f"run_dir={folder}"]
+    with initialize_config_module("rpg.conf", version_base="1.3"):
+        return compose("config", ["env=maze", f"trainer.steps={steps}", *quiet, *overrides])

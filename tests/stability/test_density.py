@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import time
+from typing import NamedTuple
 
 import pytest
 import torch
-from record import record
+from record import maze_config, record
 
 from rpg.exploration import ObjectsOfInterest, RandomNetworkDistillation, RNDConfig
 
@@ -40,16 +41,44 @@ def remembered(capacity: int) -> float:
     return float(old / unseen)
 
 
+CELLS = [(x, y) for x in (-2, -1, 0, 1, 2) for y in (-2, -1, 0, 1, 2)]
+POCKET = (1, 1)
+
+
+def all_but_the_pocket(n: int) -> torch.Tensor:
+    return torch.cat([cell(x, y, n) for x, y in CELLS if (x, y) != POCKET])
+
+
+def trained_around_the_pocket(updates: int, **changes: object) -> RandomNetworkDistillation:
+    """Every cell but one is known."""
+    rnd = estimator(**changes)
+    rnd.observe(all_but_the_pocket(200))
+    for _ in range(updates):
+        rnd.update()
+    return rnd
+
+
 def contrast(frequencies: int) -> float:
     """How many standard deviations the one cell never entered stands out from all others, which are known."""
-    rnd = estimator(frequencies=frequencies)
-    known = [(x, y) for x in (-2, -1, 0, 1, 2) for y in (-2, -1, 0, 1, 2) if (x, y) != (1, 1)]
-    for x, y in known:
-        rnd.observe(cell(x, y, 200))
-    for _ in range(1500):
-        rnd.update()
-    around = torch.cat([rnd.error(cell(x, y, 100)) for x, y in known])
-    return float((rnd.error(cell(1, 1, 500)).mean() - around.mean()) / around.std())
+    rnd = trained_around_the_pocket(1500, frequencies=frequencies)
+    around = rnd.error(all_but_the_pocket(100))
+    return float((rnd.error(cell(*POCKET, 500)).mean() - around.mean()) / around.std())
+
+
+class Bonus(NamedTuple):
+    """Mean error and bonus where everything is known, and in the cell never entered, in units of the coefficient."""
+
+    known_error: float
+    novel_error: float
+    known: float
+    novel: float
+
+
+def bonus_after(updates: int, forgetting: float) -> Bonus:
+    rnd = trained_around_the_pocket(updates, forgetting=forgetting, coefficient=1.0)
+    known, novel = all_but_the_pocket(50), cell(*POCKET, 500)
+    values = (rnd.error(known), rnd.error(novel), rnd.bonus(known), rnd.bonus(novel))
+    return Bonus(*(float(value.mean()) for value in values))
 
 
 def test_small_buffer_forgets_where_it_has_been() -> None:
@@ -62,6 +91,28 @@ def test_without_encoding_an_unvisited_pocket_looks_known() -> None:
     assert contrast(6) > 1.5 * contrast(0)
 
 
+def test_statistics_of_the_whole_run_take_the_last_unknown_cell_for_a_known_one() -> None:
+    """Its error is well above that of known cells, and yet below the mean of a run that began with large errors."""
+    cumulative, forgetting = bonus_after(2000, 0.0), bonus_after(2000, 0.01)
+    assert cumulative[:2] == forgetting[:2]  # the same predictor, judged in two ways
+    assert cumulative.novel_error > 1.3 * cumulative.known_error
+    assert cumulative.novel < 0  # nothing draws the agent there
+    assert cumulative.novel - cumulative.known < 0.3
+    assert forgetting.novel > 1
+    assert forgetting.novel - forgetting.known > 1
+
+
+@pytest.mark.long
+def test_shipped_forgetting_against_the_whole_run_for_20k_updates() -> None:
+    start = time.perf_counter()
+    cumulative, forgetting = bonus_after(20_000, 0.0), bonus_after(20_000, 0.001)
+    ratio = (forgetting.novel - forgetting.known) / (cumulative.novel - cumulative.known)
+    passed = forgetting.novel > 1 and ratio > 3
+    record("forgetting", 0, {"updates": 20_000, "forgetting": 0.001}, "separation_over_cumulative", ratio, passed,
+           time.perf_counter() - start)  # fmt: skip
+    assert passed
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(("name", "overrides"), [
     ("ours", []),
@@ -72,16 +123,10 @@ def test_maze_coverage_without_buffer_or_encoding(
     name: str, overrides: list[str], tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     """40k steps each; the ablations are judged against the run of the full method, which comes first."""
-    from hydra import compose, initialize_config_module
-
     from rpg.train import train
 
     start = time.perf_counter()
-    folder = tmp_path_factory.mktemp(name)
-    with initialize_config_module("rpg.conf", version_base="1.3"):
-        cfg = compose("config", overrides=[
-            "env=maze", "trainer.steps=40000", "trainer.eval_every=0", "logger=files", f"run_dir={folder}", *overrides
-        ])  # fmt: skip
+    cfg = maze_config(tmp_path_factory.mktemp(name), 40_000, *overrides)
     coverage = train(cfg)["train/coverage"]
     passed = coverage > 0.45 if name == "ours" else coverage < _COVERAGE.get("ours", 1.0)
     _COVERAGE[name] = coverage

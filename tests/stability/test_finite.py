@@ -1,87 +1,128 @@
-"""The model's loss and the entropy weight stay finite where inputs are degenerate or targets unreachable."""
+"""Losses, the entropy weight and every average stay finite where inputs are degenerate or targets unreachable."""
 
 from __future__ import annotations
 
+import math
 import time
+from typing import NamedTuple
 
-import gymnasium as gym
-import numpy as np
 import pytest
 import torch
 from record import record
+from tiny import leaves, make_agent, make_rnd, noise_batch
 
-from rpg.agents import RPG, RPGConfig, WorldModelConfig
-from rpg.exploration import ObjectsOfInterest, RandomNetworkDistillation, RNDConfig
-from rpg.segments import SegmentBatch
+from rpg.agents import RPG
+from rpg.exploration import RandomNetworkDistillation
 
-OBS, ACT = 4, 2
-OBJECTS = ObjectsOfInterest.of((0, 1))
-
-
-def make_agent(**changes: object) -> RPG:
-    torch.manual_seed(0)
-    config = RPGConfig(
-        batch_size=16,
-        width=32,
-        lr=1e-3,
-        world_model=WorldModelConfig(state_dim=16, width=32, lr=1e-3),
-        **changes,  # type: ignore[arg-type]
-    )
-    box = gym.spaces.Box(-np.inf, np.inf, (OBS,))
-    return RPG(box, gym.spaces.Box(-1.0, 1.0, (ACT,)), config, OBJECTS)
+KINDS = ["constant", "zero", "huge"]
 
 
-def batch(agent: RPG, kind: str) -> SegmentBatch:
-    steps, n = agent.horizon, agent.batch_size
-    scale = {"constant": 0.0, "zero": 0.0, "huge": 1e10, "ordinary": 1.0}[kind]
-    offset = 3.0 if kind == "constant" else 0.0
-    reward_scale = 1e4 if kind == "huge" else 1.0
-    return SegmentBatch(
-        obs=torch.randn(n, OBS) * scale + offset,
-        next_obs=torch.randn(steps, n, OBS) * scale + offset,
-        action=torch.rand(steps, n, ACT) * 2 - 1,
-        reward=torch.randn(steps, n) * reward_scale * (kind != "zero"),
-        terminated=torch.zeros(steps, n),
-        mask=torch.ones(steps, n),
-        latent=torch.randn(n, agent.latent_dim),
-        step=torch.ones(n),
-    )
+class Trained(NamedTuple):
+    """An agent and a bonus after training, the largest loss of the latent states, and what was not finite."""
+
+    agent: RPG
+    rnd: RandomNetworkDistillation
+    largest: float
+    not_finite: set[str]
 
 
-def largest_after(kind: str, updates: int) -> tuple[float, bool]:
-    """Train with an exploration bonus; returns the largest loss seen and whether all stayed finite."""
-    agent = make_agent()
-    rnd = RandomNetworkDistillation(OBJECTS, RNDConfig(width=32, batch_size=16, capacity=1000, warmup=10))
-    largest, finite = 0.0, True
+def train(kind: str, updates: int) -> Trained:
+    agent, rnd = make_agent(), make_rnd(forgetting=0.001)
+    largest, not_finite = 0.0, set()
     for i in range(updates):
-        data = batch(agent, kind)
+        data = noise_batch(agent, kind)
         rnd.observe(data.obs)
         metrics = rnd.update()
         metrics |= agent.update(rnd.relabel(data))
         if i % 50 == 0 or i == updates - 1:
-            losses = torch.stack([v for k, v in metrics.items() if k.startswith(("loss/", "train/"))])
-            finite &= bool(losses.isfinite().all())
+            not_finite |= {name for name, value in metrics.items() if not value.isfinite()}
             largest = max(largest, float(metrics["loss/state"]))
-    finite &= all(bool(p.isfinite().all()) for p in agent.model.parameters())
-    return largest, finite
+    return Trained(agent, rnd, largest, not_finite)
 
 
-@pytest.mark.parametrize("kind", ["constant", "zero", "huge"])
-def test_losses_stay_finite(kind: str) -> None:
-    largest, finite = largest_after(kind, 200)
-    assert finite
+def unsound(agent: RPG, rnd: RandomNetworkDistillation) -> list[str]:
+    """Everything learned or counted that is not finite or outside its range; NaN lies in no range."""
+    state = dict(leaves({"agent": agent.state_dict(), "rnd": rnd.state_dict()}))
+    cfg = agent.config
+    bad = {name for name, value in state.items() if not value.isfinite().all()}
+    # Averages of squared gradients, so within the square of what gradients are clipped to.
+    clips = {"agent/model": cfg.world_model.grad_clip, "agent/policy": cfg.grad_clip}
+    for owner in ("agent/model", "agent/policy", "agent/aux", "rnd"):
+        name = "rnd/optimizer/square" if owner == "rnd" else f"{owner}_optimizer/square"
+        square, largest = state[name], clips.get(owner, math.inf) ** 2
+        if not ((square >= 0) & (square <= largest)).all():
+            bad.add(name)
+    _, var, weight, updates = state["rnd/normalizer/stats"].tolist()
+    if not (var >= 0 and weight > 0 and updates == float(state["rnd/optimizer/count"])):
+        bad.add("rnd/normalizer/stats")
+    if not 0 < float(agent.alpha) <= cfg.max_alpha:
+        bad.add("agent/log_alpha")
+    return sorted(bad)
+
+
+def standing_still(before: dict[str, torch.Tensor], agent: RPG, rnd: RandomNetworkDistillation) -> list[str]:
+    """Networks and coefficients that training has not changed at all."""
+    after = dict(leaves({"agent": agent.state_dict(), "rnd": rnd.state_dict()}))
+    parts = ("agent/model/", "agent/target/", "agent/policy/", "agent/log_alpha", "rnd/predictor/")
+    return [
+        part
+        for part in parts
+        if all(torch.equal(before[name], after[name]) for name in after if name.startswith(part))
+    ]
+
+
+def start() -> dict[str, torch.Tensor]:
+    """What :func:`train` begins with."""
+    agent, rnd = make_agent(), make_rnd()
+    return dict(leaves({"agent": agent.state_dict(), "rnd": rnd.state_dict()}))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_losses_and_statistics_stay_finite(kind: str) -> None:
+    agent, rnd, largest, not_finite = train(kind, 300)
+    assert not_finite == set()
     assert largest < 1e6
+    assert unsound(agent, rnd) == []
+    assert standing_still(start(), agent, rnd) == []
+
+
+@pytest.mark.parametrize("name", [
+    "agent/target/encoder.0.weight", "agent/log_alpha", "agent/model_optimizer/mean", "agent/policy_optimizer/square",
+    "agent/aux_optimizer/square", "rnd/predictor/0.weight", "rnd/optimizer/mean", "rnd/normalizer/stats",
+])  # fmt: skip
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_one_broken_number_anywhere_is_seen(name: str, value: float) -> None:
+    agent, rnd = make_agent(), make_rnd()
+    rnd.observe(torch.zeros(16, 4))
+    rnd.update()
+    assert unsound(agent, rnd) == []
+    states = {"agent": agent.state_dict(), "rnd": rnd.state_dict()}
+    dict(leaves(states))[name].view(-1)[0] = value
+    agent.load_state_dict(states["agent"])
+    rnd.load_state_dict(states["rnd"])
+    assert unsound(agent, rnd) == [name]
+
+
+def test_an_unclipped_moment_is_seen() -> None:
+    agent, rnd = make_agent(), make_rnd()
+    rnd.observe(torch.zeros(16, 4))
+    rnd.update()
+    agent._model_optimizer.square[0] = 1.1 * agent.config.world_model.grad_clip**2
+    assert unsound(agent, rnd) == ["agent/model_optimizer/square"]
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("kind", ["constant", "zero", "huge"])
-def test_losses_stay_finite_for_1e5_updates(kind: str) -> None:
-    start = time.perf_counter()
-    largest, finite = largest_after(kind, 100_000)
-    passed = finite and largest < 1e6
-    record("finite_losses", 0, {"observations": kind, "updates": 100_000}, "largest_state_loss", largest, passed,
-           time.perf_counter() - start)  # fmt: skip
-    assert passed
+@pytest.mark.parametrize("kind", KINDS)
+def test_losses_and_statistics_stay_finite_for_1e5_updates(kind: str) -> None:
+    begun = time.perf_counter()
+    agent, rnd, largest, not_finite = train(kind, 100_000)
+    broken = [*sorted(not_finite), *unsound(agent, rnd), *standing_still(start(), agent, rnd)]
+    wall_s = time.perf_counter() - begun
+    settings = {"observations": kind, "updates": 100_000}
+    record("finite_losses", 0, settings, "largest_state_loss", largest, largest < 1e6, wall_s)
+    record("finite_statistics", 0, settings, "broken", len(broken), not broken, wall_s)
+    assert broken == []
+    assert largest < 1e6
 
 
 def alpha_after(updates: int, entropy_target: float) -> tuple[float, RPG]:
@@ -90,7 +131,7 @@ def alpha_after(updates: int, entropy_target: float) -> tuple[float, RPG]:
     # Faster than any setting we ship, so that few updates show what many would do.
     agent._aux_optimizer.lr = 0.1
     for _ in range(updates):
-        agent.update(batch(agent, "ordinary"))
+        agent.update(noise_batch(agent, "ordinary"))
     return float(agent.alpha), agent
 
 
@@ -99,7 +140,7 @@ def test_alpha_stops_at_its_bound_and_comes_back() -> None:
     assert alpha == pytest.approx(2.0, rel=1e-3)
     agent.config.entropy_target = -50.0
     for _ in range(100):
-        agent.update(batch(agent, "ordinary"))
+        agent.update(noise_batch(agent, "ordinary"))
     assert float(agent.alpha) < 1.0
 
 

@@ -13,7 +13,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from record import record
+from record import maze_config, record
 from torch import Tensor
 
 from rpg.agents import RPG, LatentConfig, RPGConfig, WorldModelConfig
@@ -108,19 +108,14 @@ def test_moderate_beta_keeps_several_modes_of_the_bandit() -> None:
 @pytest.mark.parametrize("beta", [0.0, 0.01, 0.5])
 def test_information_in_the_maze(beta: float, tmp_path_factory: pytest.TempPathFactory) -> None:
     """25k steps with a categorical z: information between z and the cell where an episode ends."""
-    from hydra import compose, initialize_config_module
-
     from rpg.envs.make import make_envs
     from rpg.train import assemble
     from rpg.training.build import parse_config
 
     start = time.perf_counter()
-    with initialize_config_module("rpg.conf", version_base="1.3"):
-        cfg = compose("config", overrides=[
-            "env=maze", "agent.latent.gaussian=0", "agent.latent.categories=12", f"agent.beta={beta}",
-            "trainer.steps=25000", "trainer.eval_every=0", "logger=files",
-            f"run_dir={tmp_path_factory.mktemp('run')}",
-        ])  # fmt: skip
+    categorical = ["agent.latent.gaussian=0", "agent.latent.categories=12"]
+    folder = tmp_path_factory.mktemp("run")
+    cfg = maze_config(folder, 25_000, *categorical, f"agent.beta={beta}")
     trainer, _ = assemble(cfg)
     trainer.train()
     agent = trainer.agent

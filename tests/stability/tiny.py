@@ -50,7 +50,7 @@ def noise_batch(agent: RPG, kind: str) -> SegmentBatch:
 def pushed_batch(agent: RPG, offset: float = 0.0) -> SegmentBatch:
     """A point that each action pushes, and a reward for being near 0: all of it can be learned.
 
-    ``offset`` is added to every reward; by it the values grow to offset / (1 - gamma).
+    ``offset`` is added to every reward, so that values grow towards offset / (1 - gamma).
     """
     obs = torch.rand(agent.batch_size, OBS) * 2 - 1
     action = torch.rand(agent.horizon, agent.batch_size, ACT) * 2 - 1
