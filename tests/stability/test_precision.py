@@ -158,8 +158,10 @@ def distances(run: Run, other: Run) -> dict[str, float]:
 
 
 def allowed(full: Run, second: Run) -> dict[str, float]:
-    """Twice what another seed makes, and at least what seeds have been seen to make."""
-    least = {"coverage": 0.2, "alpha": 0.2, "rnd_mean": 0.3, "rnd_std": 0.3}
+    """Twice what another seed makes, but two seeds can be alike by chance: of recorded ones the coverage varied by
+    0.05 (standard deviation, late in a run) and alpha by 12 %; two of them then differ by up to 2.8 times that.
+    """
+    least = {"coverage": 0.15, "alpha": 0.35, "rnd_mean": 0.35, "rnd_std": 0.35}
     return {name: max(least[name], 2 * distance) for name, distance in distances(full, second).items()}
 
 
