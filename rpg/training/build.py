@@ -12,6 +12,7 @@ from omegaconf.errors import ConfigKeyError, MissingMandatoryValue, OmegaConfBas
 
 from rpg.agents import RPG, Agent, RPGConfig
 from rpg.agents.scripted import SCRIPTED, make_scripted
+from rpg.allocation import keep_freed_memory
 from rpg.compiling import compiler_missing
 from rpg.envs.config import EnvConfig
 from rpg.envs.make import declared_objects, make_envs
@@ -142,6 +143,7 @@ def build_trainer(run: RunConfig) -> Trainer:
         torch.set_num_threads(run.threads)
     # Saturated networks make numbers so small that a CPU computes with them many times slower.
     torch.set_flush_denormal(True)
+    keep_freed_memory()
     torch.manual_seed(run.seed)
     np.random.seed(run.seed)  # some gymnasium environments draw from numpy's global generator
     envs = make_envs(run.env)
