@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 
-.PHONY: demo test test-long lint format docs bench figures clean
+.PHONY: demo test test-long lint format docs bench figures system-deps clean
 
 # Core alone: what training needs, no simulator.
 $(VENV)/.core: pyproject.toml constraints.txt scripts/install.sh
@@ -11,12 +11,16 @@ $(VENV)/.core: pyproject.toml constraints.txt scripts/install.sh
 	@touch $@
 
 $(VENV)/.dev: $(VENV)/.core
-	PYTHON="$(PYTHON)" sh scripts/install.sh "$(VENV)" ".[dev,wandb,joblib,slurm]"
+	PYTHON="$(PYTHON)" sh scripts/install.sh "$(VENV)" ".[dev,wandb,joblib,slurm,mujoco,metaworld,maniskill]"
 	@touch $@
 
 $(VENV)/.docs: $(VENV)/.core
 	PYTHON="$(PYTHON)" sh scripts/install.sh "$(VENV)" ".[docs]"
 	@touch $@
+
+# OSMesa and a Vulkan device: what drawing without a screen needs on Debian and Ubuntu.
+system-deps:
+	sh scripts/system_deps.sh
 
 demo: $(VENV)/.core
 	$(BIN)/python scripts/demo.py

@@ -27,7 +27,7 @@ from rpg.provenance import commit
 from rpg.training.loggers import write_atomic
 
 PARTS = ("precision", "envs", "mujoco", "kernels")
-CHEETAH = ("env=gym", "env.id=HalfCheetah-v5", "env.asynchronous=true")
+CHEETAH = ("env=gymnasium", "env.id=HalfCheetah-v5", "env.asynchronous=true")
 
 
 def commands(args: argparse.Namespace, part: str) -> list[list[str]]:

@@ -2,7 +2,7 @@
 
     python benchmarks/learning.py                              # published sizes, float32, two threads
     python benchmarks/learning.py --size fast --threads 1 --against eager
-    python benchmarks/learning.py --dtype bfloat16 --no-compile env=gym env.id=Pendulum-v1
+    python benchmarks/learning.py --dtype bfloat16 --no-compile env=gymnasium env.id=Pendulum-v1
 
 One update is what training does per five decisions: predictor step of the exploration bonus, sampling,
 relabelling, world model, and every second time the policy. Floating-point operations are counted by torch

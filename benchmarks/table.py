@@ -96,6 +96,21 @@ def replaying(lines: list[Line]) -> str:
     return markdown([*head.split(","), "commit"], rows)
 
 
+def threading(lines: list[Line]) -> str:
+    """Threads, one row for each thread count and number of other processes."""
+    head = "name,on,dtype,compiled,threads,other busy processes,updates/s,env steps/s,share of matmul rate"
+    numbers = ("updates_per_s", "env_steps_per_s", "share")
+    rows = [
+        [
+            line["name"], line["cpu"], line["dtype"], yes(line["compile"]), str(point["threads"]),
+            str(point["others"]), *(number(point[key]) for key in numbers), line["commit"],
+        ]
+        for line in lines
+        for point in line["points"]
+    ]  # fmt: skip
+    return markdown([*head.split(","), "commit"], rows)
+
+
 def tables(folder: Path) -> str:
     """What stands between the markers, from the files of ``folder``."""
     lines = newest(
@@ -106,6 +121,7 @@ def tables(folder: Path) -> str:
         ("Learning", "learning/", learning),
         ("Acting", "act/", acting),
         ("Replay", "replay", replaying),
+        ("Threads", "threads/", threading),
     ):
         text = write([line for line in lines if line["name"].startswith(kind)])
         parts += [f"### {title}", text] if text else []

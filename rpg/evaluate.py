@@ -2,13 +2,16 @@
 
 rpg-evaluate runs/maze/rpg/seed0
 rpg-evaluate runs/maze/rpg/seed0 --episodes 50 --seed 7
+rpg-evaluate runs/maze/rpg/seed0 --video episodes.mp4
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 from omegaconf import OmegaConf
 
@@ -17,7 +20,9 @@ from rpg.envs.make import make_envs
 from rpg.errors import RPGError
 from rpg.training.build import build_agent, parse_config
 from rpg.training.checkpoint import load_checkpoint
+from rpg.training.config import RunConfig
 from rpg.training.runner import evaluate, summarize
+from rpg.training.video import film
 
 
 def evaluate_run(run_dir: Path, episodes: int, seed: int, num_envs: int | None = None) -> dict[str, float]:
@@ -29,12 +34,7 @@ def evaluate_run(run_dir: Path, episodes: int, seed: int, num_envs: int | None =
     Raises:
         RPGError: not a run folder, or a damaged checkpoint.
     """
-    state = load_checkpoint(run_dir / "checkpoint.pt")
-    if not state["config"]:
-        raise RPGError(
-            f"{run_dir}: its checkpoint has no config, so the agent cannot be rebuilt; use rpg.training"
-        )
-    run = parse_config(OmegaConf.create(state["config"]))
+    run, state = _load(run_dir)
     envs = make_envs(run.env, num_envs or run.trainer.eval_envs)
     agent, _ = build_agent(run, envs)
     agent.load_state_dict(state["agent"])
@@ -46,17 +46,46 @@ def evaluate_run(run_dir: Path, episodes: int, seed: int, num_envs: int | None =
     return result
 
 
+def film_run(run_dir: Path, path: Path, episodes: int, seed: int, deterministic: bool = True) -> None:
+    """Load the checkpoint of ``run_dir`` and write a video of whole episodes.
+
+    Raises:
+        RPGError: not a run folder, a damaged checkpoint, or an environment that draws nothing.
+    """
+    run, state = _load(run_dir)
+    with closing(make_envs(run.env, 1, render=True)) as envs:
+        agent, _ = build_agent(run, envs)
+        agent.load_state_dict(state["agent"])
+        film(agent, envs, path, episodes, seed, deterministic, run.env.name)
+
+
+def _load(run_dir: Path) -> tuple[RunConfig, dict[str, Any]]:
+    state = load_checkpoint(run_dir / "checkpoint.pt")
+    if not state["config"]:
+        raise RPGError(
+            f"{run_dir}: its checkpoint has no config, so the agent cannot be rebuilt; use rpg.training"
+        )
+    return parse_config(OmegaConf.create(state["config"])), state
+
+
 def main(argv: list[str] | None = None) -> int:
     """Console entry point ``rpg-evaluate``: prints one JSON object."""
     parser = argparse.ArgumentParser(prog="rpg-evaluate", description="Evaluate a trained run.")
     parser.add_argument("run", type=Path, help="run folder")
     parser.add_argument("--episodes", type=int, default=20, help="episodes per mode (default 20)")
     parser.add_argument("--seed", type=int, default=0, help="equal seeds give equal episodes (default 0)")
+    parser.add_argument("--video", type=Path, help="also film episodes, into this .mp4 or .gif")
+    parser.add_argument("--video-episodes", type=int, default=3, help="how many to film (default 3)")
     args = parser.parse_args(argv)
     with report_errors():
-        if args.episodes < 1:
-            raise RPGError(f"--episodes {args.episodes}: must be at least 1")
-        print(json.dumps({"run": str(args.run), **evaluate_run(args.run, args.episodes, args.seed)}))
+        for option, value in (("--episodes", args.episodes), ("--video-episodes", args.video_episodes)):
+            if value < 1:
+                raise RPGError(f"{option} {value}: must be at least 1")
+        result: dict[str, Any] = {"run": str(args.run), **evaluate_run(args.run, args.episodes, args.seed)}
+        if args.video:
+            film_run(args.run, args.video, args.video_episodes, args.seed)
+            result["video"] = str(args.video)
+        print(json.dumps(result))
     return 0
 
 

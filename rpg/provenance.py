@@ -6,6 +6,7 @@ import os
 import platform
 import subprocess
 import sys
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,20 @@ def commit() -> str:
     return f"{head}-dirty" if changed else head
 
 
+_SIMULATORS = ("gymnasium", "mujoco", "gymnasium-robotics", "metaworld", "sapien", "mani-skill")
+
+
+def simulator_versions() -> dict[str, str]:
+    """Installed versions of gymnasium and of every simulator that is there; imports none of them."""
+    found = {}
+    for name in _SIMULATORS:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return found
+
+
 def provenance() -> dict[str, Any]:
     """Plain facts for a result file."""
     return {
@@ -53,6 +68,7 @@ def provenance() -> dict[str, Any]:
         "version": __version__,
         "python": platform.python_version(),
         "torch": torch.__version__,
+        "simulators": simulator_versions(),
         "platform": platform.platform(terse=True),
         "cpu": cpu_name(),
         "cores": os.cpu_count(),

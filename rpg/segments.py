@@ -13,7 +13,7 @@ class SegmentBatch(NamedTuple):
     Where an episode ends inside a segment, the remaining steps repeat its last transition and ``mask`` is 0.
 
     Attributes:
-        obs: (N, obs_dim), the first observation of each segment.
+        obs: (N, obs_dim), the first observation of each segment; pictures are flat uint8.
         next_obs: (K, N, obs_dim), what each action led to; after a last step the true final observation.
         action: (K, N, action_dim), in the environment's units.
         reward: (K, N), as the environment gave it.

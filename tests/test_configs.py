@@ -71,7 +71,7 @@ def test_every_setting_can_be_given_on_the_command_line(composed: Composed) -> N
 
 
 def test_environment_settings_reach_the_agent(composed: Composed) -> None:
-    run = parse_config(composed("env=gym", "env.reward_scale=5", "env.obs_scale=0.5"))
+    run = parse_config(composed("env=gymnasium", "env.reward_scale=5", "env.obs_scale=0.5"))
     assert (run.agent.reward_scale, run.agent.obs_scale) == (5.0, 0.5)
     assert run.env.name == "Pendulum-v1"
 
@@ -84,7 +84,7 @@ def test_environments_in_the_configs_are_registered_or_need_a_package() -> None:
             assert env_id in gymnasium.registry, path.name
 
 
-@pytest.mark.parametrize("env", ["maze", "gym", "bandit"])
+@pytest.mark.parametrize("env", ["maze", "gymnasium", "bandit"])
 @pytest.mark.parametrize("agent", AGENTS)
 def test_every_agent_runs_the_debug_preset(composed: Composed, tmp_path: Path, agent: str, env: str) -> None:
     quick = ["trainer.steps=60", "trainer.seed_decisions=40", "trainer.picture_every=0"]
@@ -93,7 +93,7 @@ def test_every_agent_runs_the_debug_preset(composed: Composed, tmp_path: Path, a
         quick.append("+agent.position=1")  # it looks at two entries otherwise; here there is one
     row = train(composed("experiment=debug", f"agent={agent}", f"env={env}", *quick))
     assert row["env_steps"] == 60
-    assert row["eval/deterministic/length"] == {"maze": 50, "gym": 200, "bandit": 1}[env]
+    assert row["eval/deterministic/length"] == {"maze": 50, "gymnasium": 200, "bandit": 1}[env]
     assert (row["updates"] > 0) == (agent in LEARNERS) == ("loss/state" in row) == ("loss/rnd" in row)
     assert ("loss/posterior" in row) == (agent == "rpg")
     assert (tmp_path / "run" / "checkpoint.pt").exists()

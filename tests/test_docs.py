@@ -20,7 +20,11 @@ from rpg.envs.config import EnvConfig
 from rpg.exploration import RNDConfig
 
 ROOT = Path(__file__).parents[1]
-PAGES = ["README.md", "CONTRIBUTING.md", *sorted(f"docs/{p.name}" for p in (ROOT / "docs").glob("*.md"))]
+PAGES = [
+    "README.md",
+    "CONTRIBUTING.md",
+    *sorted(str(p.relative_to(ROOT)) for p in (ROOT / "docs").rglob("*.md")),
+]
 RUN_PAGES = ("README.md", "docs/quickstart.md")
 EXAMPLE_PAGES = ("README.md", "docs/agents.md", "docs/environments.md")
 
@@ -136,7 +140,7 @@ def test_files_named_in_passing_exist(page: str) -> None:
 
 def test_every_page_is_in_the_navigation() -> None:
     config = yaml.safe_load((ROOT / "mkdocs.yml").read_text())
-    listed = re.findall(r"[\w-]+\.md", str(config["nav"]))
+    listed = re.findall(r"[\w/-]+\.md", str(config["nav"]))
     assert sorted(f"docs/{name}" for name in listed) == [p for p in PAGES if p.startswith("docs/")]
 
 

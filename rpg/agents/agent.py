@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from rpg.errors import RPGError
+from rpg.pixels import FrameShape
 from rpg.segments import SegmentBatch
 
 Metrics = dict[str, Tensor]
@@ -22,6 +23,7 @@ class Agent:
 
     Attributes:
         obs_dim: length of the observation vector.
+        frames: what the vector consists of, if it is pictures.
         action_dim: length of the action vector.
         latent_dim: length of z; 0 if the agent has none.
         batch_size: segments per update; 0 if the agent does not learn.
@@ -40,10 +42,12 @@ class Agent:
         action_space: gym.Space[Any],
         device: torch.device | str = "cpu",
     ) -> None:
-        if not isinstance(observation_space, gym.spaces.Box) or len(observation_space.shape) != 1:
+        self.frames = FrameShape.of(observation_space)
+        flat = isinstance(observation_space, gym.spaces.Box) and len(observation_space.shape) == 1
+        if self.frames is None and not flat:
             raise RPGError(
-                f"observation space {_brief(observation_space)}: a flat Box is needed; wrap the environment with "
-                "gymnasium.wrappers.FlattenObservation"
+                f"observation space {_brief(observation_space)}: a flat Box is needed, or pictures (height, width, "
+                "channels) of uint8; wrap the environment with gymnasium.wrappers.FlattenObservation"
             )
         if not isinstance(action_space, gym.spaces.Box) or len(action_space.shape) != 1:
             raise RPGError(f"action space {_brief(action_space)}: a flat Box of continuous actions is needed")
@@ -52,7 +56,7 @@ class Agent:
                 f"action space {_brief(action_space)}: bounds must be finite; wrap the environment with "
                 "gymnasium.wrappers.RescaleAction"
             )
-        self.obs_dim = observation_space.shape[0]
+        self.obs_dim = int(np.prod(observation_space.shape or ()))
         self.action_dim = action_space.shape[0]
         self.device = torch.device(device)
         low = torch.as_tensor(action_space.low, dtype=torch.float32, device=self.device)

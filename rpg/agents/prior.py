@@ -25,10 +25,17 @@ class LatentPrior:
         obs_dim: length of a raw observation, as remembered.
         config: the agent's settings; ``config.prior`` decides the mode.
         device: where network and memory live.
+        obs_dtype: of an observation.
     """
 
     def __init__(
-        self, space: LatentSpace, state_dim: int, obs_dim: int, config: RPGConfig, device: torch.device
+        self,
+        space: LatentSpace,
+        state_dim: int,
+        obs_dim: int,
+        config: RPGConfig,
+        device: torch.device,
+        obs_dtype: torch.dtype = torch.float32,
     ) -> None:
         self.learned = config.prior.mode != "fixed" and space.dim > 0
         self._config = config.prior
@@ -42,7 +49,7 @@ class LatentPrior:
             # Starts exactly at the fixed prior.
             nn.init.zeros_(self._net[-1].weight)  # type: ignore[arg-type]
             self._optimizer = torch.optim.Adam(self._net.parameters(), config.prior.lr, fused=True)
-            self._starts = torch.zeros(_REMEMBERED_STARTS, obs_dim, device=device)
+            self._starts = torch.zeros(_REMEMBERED_STARTS, obs_dim, device=device, dtype=obs_dtype)
             self._seen = 0
 
     def sample(self, n: int, state: Tensor | None) -> Tensor:

@@ -17,6 +17,7 @@ from rpg.agents.prior import LatentPrior
 from rpg.compiling import compile_region, keep_address
 from rpg.exploration.objects import ObjectsOfInterest
 from rpg.flat import FlatAdam, FlatParameters
+from rpg.pixels import FrameShape
 from rpg.policies import LatentPolicy, LatentPosterior, make_latent_space
 from rpg.segments import SegmentBatch
 from rpg.world_model import ObservationInput, WorldModel
@@ -49,7 +50,7 @@ class RPG(Agent):
     """Latent-variable policy, trained through a latent world model to maximise the bound of Eq. 3.2.
 
     Args:
-        observation_space: a flat Box.
+        observation_space: a flat Box, or one of (stacked) pictures, uint8.
         action_space: a flat, bounded Box.
         config: see :class:`RPGConfig`.
         objects: objects of interest, encoded into the networks' input; None for none.
@@ -70,9 +71,13 @@ class RPG(Agent):
         self.latent_dim = self.space.dim
         self.batch_size, self.horizon = cfg.batch_size, cfg.world_model.horizon
         objects = objects or ObjectsOfInterest.of(())
-        self._input = ObservationInput(self.obs_dim, objects, cfg.obs_scale, cfg.observation_frequencies)
+        self._input: nn.Module = nn.Identity()  # pictures are scaled by their encoder
+        inputs: int | FrameShape | None = self.frames
+        if inputs is None:
+            self._input = ObservationInput(self.obs_dim, objects, cfg.obs_scale, cfg.observation_frequencies)
+            inputs = self._input.dim
         state_dim, act = cfg.world_model.state_dim, cfg.world_model.activation
-        self.model = WorldModel(self._input.dim, self.action_dim, self.latent_dim, cfg.world_model)
+        self.model = WorldModel(inputs, self.action_dim, self.latent_dim, cfg.world_model)
         self.policy = LatentPolicy(state_dim, self.latent_dim, self.action_dim, cfg.width, cfg.base_std, act)
         self.posterior = (
             LatentPosterior(state_dim, self.action_dim, self.space, cfg.width, act)
@@ -83,7 +88,8 @@ class RPG(Agent):
         for net in (self._input, self.model, self.policy, self._aux):
             net.to(self.device)
         self.target = copy.deepcopy(self.model)
-        self.prior = LatentPrior(self.space, state_dim, self.obs_dim, cfg, self.device)
+        obs_dtype = torch.uint8 if self.frames else torch.float32
+        self.prior = LatentPrior(self.space, state_dim, self.obs_dim, cfg, self.device, obs_dtype)
         self._noise = torch.zeros(0, self.action_dim, device=self.device)
         self._updates = 0
         self._actor_weights = horizon_weights(cfg.actor_horizon, cfg.horizon_decay)

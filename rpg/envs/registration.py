@@ -5,6 +5,9 @@ from __future__ import annotations
 import gymnasium
 
 from rpg.envs.bandit import register_bandit
+from rpg.envs.mujoco.registration import register_mujoco
+from rpg.envs.robotics_ids import register_adroit, register_metaworld
+from rpg.envs.sapien.registration import register_sapien
 
 MAZES = {
     "rpg/GapMaze-v1": "gap_v1",
@@ -20,6 +23,10 @@ MAZES = {
 def register_all() -> None:
     """Register every environment with gymnasium; safe to call again. Nothing heavy is imported."""
     register_bandit()
+    register_mujoco()
+    register_adroit()
+    register_metaworld()
+    register_sapien()
     for env_id, layout in MAZES.items():
         if env_id not in gymnasium.registry:
             gymnasium.register(

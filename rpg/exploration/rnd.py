@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +15,7 @@ from rpg.exploration.normalizer import RunningNormalizer
 from rpg.exploration.objects import ObjectSelector, ObjectsOfInterest
 from rpg.exploration.positional import encoded_dim, positional_encoding
 from rpg.flat import FlatAdam
+from rpg.pixels import FrameShape, PixelTrunk
 from rpg.segments import SegmentBatch
 
 
@@ -24,6 +26,7 @@ class RNDConfig:
     Args:
         coefficient: weight of the normalised error in the reward (0.1 in Table 3.1).
         width: hidden and output width of predictor and target.
+        channels: of their convolutions, where observations are pictures.
         frequencies: octaves of the positional encoding; 0 turns it off.
         capacity: observations in the estimator's own buffer; a small one forgets (Fig. 3.13 D).
         batch_size: observations per predictor update.
@@ -38,6 +41,7 @@ class RNDConfig:
 
     coefficient: float = 0.1
     width: int = 512
+    channels: int = 128
     frequencies: int = 6
     capacity: int = 800_000
     batch_size: int = 512
@@ -68,24 +72,33 @@ class RandomNetworkDistillation:
     The error is normalised into an approximate density and rewards are relabelled with it whenever a
     segment is sampled, so old experience is judged by present novelty.
 
+    Pictures are seen whole, and are not remembered here: they are too large to be kept twice, so
+    :meth:`update` is given some from the replay.
+
     Args:
-        objects: which observation entries to look at.
+        objects: which observation entries to look at, or the shape of pictures.
         config: sizes and weights.
         device: where networks and buffer live.
     """
 
     def __init__(
-        self, objects: ObjectsOfInterest, config: RNDConfig, device: torch.device | str = "cpu"
+        self,
+        objects: ObjectsOfInterest | FrameShape,
+        config: RNDConfig,
+        device: torch.device | str = "cpu",
     ) -> None:
         self.config = config
-        self._select = ObjectSelector(objects).to(device)
-        in_dim = encoded_dim(objects.dim, config.frequencies)
-        self._target = _rnd_net(in_dim, config.width).to(device).requires_grad_(False)
-        self._predictor = _rnd_net(in_dim, config.width).to(device)
+        self.remembers = not isinstance(objects, FrameShape)
+        self._select: nn.Module = nn.Identity()
+        kept = 0
+        if not isinstance(objects, FrameShape):
+            self._select, kept = ObjectSelector(objects).to(device), objects.dim
+        self._target = _rnd_net(objects, config).to(device).requires_grad_(False)
+        self._predictor = _rnd_net(objects, config).to(device)
         self._normalizer = RunningNormalizer(config.forgetting, config.warmup).to(device)
         self._optimizer = FlatAdam(self._predictor, config.lr)
         self._device = torch.device(device)
-        self._buffer = torch.empty(config.capacity, objects.dim, device=device)
+        self._buffer = torch.empty(config.capacity if self.remembers else 0, kept, device=device)
         self._stored = 0
         self._ticks = 0
         self._learn_region, self._bonus_region = self._learn, self._bonus
@@ -99,7 +112,10 @@ class RandomNetworkDistillation:
         self._bonus_region = compile_region(self._bonus, "bonus", self._device)
 
     def observe(self, obs: Tensor) -> None:
-        """Remember observations (n, obs_dim)."""
+        """Remember observations (n, obs_dim); pictures are only counted."""
+        if not self.remembers:
+            self._stored += len(obs)
+            return
         picked = self._select(obs)
         rows = (torch.arange(len(picked), device=self._device) + self._stored) % self.config.capacity
         self._buffer[rows] = picked
@@ -107,17 +123,23 @@ class RandomNetworkDistillation:
 
     @property
     def ready(self) -> bool:
-        """Whether the buffer holds a full batch."""
+        """Whether a full batch has been observed."""
         return self._stored >= self.config.batch_size
 
-    def update(self) -> dict[str, Tensor]:
+    def update(self, draw: Callable[[int], Tensor] | None = None) -> dict[str, Tensor]:
         """One gradient step of the predictor on remembered observations; scalars stay on the device.
 
         With ``update_every`` above 1 only every n-th call takes one; the others return nothing.
+
+        Args:
+            draw: gives so many past observations (n, obs_dim); asked where none are remembered here.
         """
         self._ticks += 1
         if (self._ticks - 1) % self.config.update_every:
             return {}
+        if not self.remembers:
+            assert draw is not None
+            return self._learn_region(draw(self.config.batch_size))
         filled = min(self._stored, self.config.capacity)
         rows = torch.randint(filled, (self.config.batch_size,), device=self._device)
         return self._learn_region(self._buffer[rows])
@@ -152,7 +174,7 @@ class RandomNetworkDistillation:
         return self._error(optimizer.views(optimizer.vector), self._select(obs))
 
     def _error(self, predictor: dict[str, Tensor], picked: Tensor) -> Tensor:
-        encoded = positional_encoding(picked, self.config.frequencies)
+        encoded = positional_encoding(picked, self.config.frequencies) if self.remembers else picked
         predicted: Tensor = torch.func.functional_call(self._predictor, predictor, (encoded,))
         return (predicted - self._target(encoded)).square().sum(-1)
 
@@ -178,9 +200,17 @@ class RandomNetworkDistillation:
         self._stored, self._ticks = state["stored"], state["ticks"]
 
 
-def _rnd_net(in_dim: int, width: int) -> nn.Sequential:
-    """Three layers with leaky ReLU and torch's own initialisation, as published."""
+def _rnd_net(objects: ObjectsOfInterest | FrameShape, config: RNDConfig) -> nn.Sequential:
+    """Three layers with leaky ReLU and torch's own initialisation, as published; convolutions before them."""
+    width = config.width
+    first: list[nn.Module] = []
+    if isinstance(objects, FrameShape):
+        first = [trunk := PixelTrunk(objects, config.channels)]
+        in_dim = trunk.dim
+    else:
+        in_dim = encoded_dim(objects.dim, config.frequencies)
     return nn.Sequential(
+        *first,
         nn.Linear(in_dim, width),
         nn.LeakyReLU(),
         nn.Linear(width, width),

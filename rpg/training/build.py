@@ -15,9 +15,10 @@ from rpg.agents.scripted import SCRIPTED, make_scripted
 from rpg.allocation import keep_freed_memory
 from rpg.compiling import compiler_missing
 from rpg.envs.config import EnvConfig
-from rpg.envs.make import declared_objects, make_envs
+from rpg.envs.make import make_envs, objects_of_interest
 from rpg.errors import CheckpointError, RPGError, nearest
 from rpg.exploration import ObjectsOfInterest, RandomNetworkDistillation, RNDConfig
+from rpg.pixels import FrameShape
 from rpg.training.checkpoint import load_checkpoint
 from rpg.training.config import LoggerConfig, RunConfig, TrainerConfig
 from rpg.training.loggers import Loggers, Sink, TensorBoardSink, WandbSink
@@ -125,11 +126,14 @@ def _compile(wanted: Any, device: str) -> bool:
 def build_agent(run: RunConfig, envs: Any) -> tuple[Agent, ObjectsOfInterest]:
     """Make the agent for these environments, and the objects of interest it was told of."""
     obs_space, action_space = envs.single_observation_space, envs.single_action_space
+    frames = FrameShape.of(obs_space, run.env.frame_stack)
+    if frames is not None:
+        obs_space = frames.space
     if run.agent_name in SCRIPTED:
         agent: Agent = make_scripted(run.agent_name, obs_space, action_space, run.device, **run.agent_options)
         return agent, ObjectsOfInterest.of(())
     Agent(obs_space, action_space)  # spaces are checked before their shape is used
-    objects = declared_objects(envs) or ObjectsOfInterest.everything(obs_space.shape[0])
+    objects = ObjectsOfInterest.of(()) if frames else objects_of_interest(run.env, envs, obs_space.shape[0])
     return RPG(obs_space, action_space, run.agent, objects, run.device), objects
 
 
@@ -150,7 +154,7 @@ def build_trainer(run: RunConfig) -> Trainer:
     agent, objects = build_agent(run, envs)
     exploration = None
     if run.exploration_name == "rnd":
-        exploration = RandomNetworkDistillation(objects, run.exploration, run.device)
+        exploration = RandomNetworkDistillation(agent.frames or objects, run.exploration, run.device)
     run_dir = Path(run.run_dir)
     trainer = Trainer(
         agent=agent,
@@ -164,6 +168,7 @@ def build_trainer(run: RunConfig) -> Trainer:
         plain_config=run.plain,
         env_name=run.env.name,
         action_repeat=run.env.action_repeat,
+        film_envs=lambda: make_envs(run.env, 1, render=True),
     )
     if run.compile:
         trainer.compile()

@@ -27,6 +27,7 @@ class TrainerConfig:
         eval_envs: sub-environments of the evaluation.
         checkpoint_every: between checkpoints.
         picture_every: between pictures; 0 never.
+        video_every: between videos of an episode with deterministic actions; 0 never.
     """
 
     steps: int = 240_000
@@ -39,12 +40,13 @@ class TrainerConfig:
     eval_envs: int = 5
     checkpoint_every: int = 10_000
     picture_every: int = 20_000
+    video_every: int = 0
 
     def __post_init__(self) -> None:
         for name in ("steps", "log_every", "checkpoint_every", "eval_episodes", "eval_envs"):
             if getattr(self, name) < 1:
                 raise RPGError(f"trainer.{name}={getattr(self, name)}: must be at least 1")
-        for name in ("seed_decisions", "decisions_per_update", "eval_every", "picture_every"):
+        for name in ("seed_decisions", "decisions_per_update", "eval_every", "picture_every", "video_every"):
             if getattr(self, name) < 0:
                 raise RPGError(f"trainer.{name}={getattr(self, name)}: must not be negative")
 

@@ -9,7 +9,9 @@ import torch
 from torch import Tensor
 
 from rpg.errors import RPGError
+from rpg.pixels import FrameShape
 from rpg.segments import SegmentBatch
+from rpg.training.frames import FrameRing
 
 
 class SegmentReplay:
@@ -17,7 +19,8 @@ class SegmentReplay:
 
     A row holds observation, next observation, action, reward, latent and three flags side by side, so
     sampling is a single gather. Both observations are kept: the last one of an episode has no successor
-    to be read from.
+    to be read from. Of pictures a row holds the numbers of their frames, which are stored once, as bytes;
+    ``capacity`` then counts frames, one for each transition and one more for each episode.
 
     Args:
         obs_dim: length of an observation vector.
@@ -26,6 +29,7 @@ class SegmentReplay:
         num_envs: sub-environments that step together.
         capacity: transitions kept; rounded down to whole vector steps.
         device: where the ring lives.
+        frames: what an observation consists of, if it is pictures.
         with_bonus: whether a transition's exploration reward is stored with it, as judged when it was made.
     """
 
@@ -38,7 +42,10 @@ class SegmentReplay:
         capacity: int = 800_000,
         device: torch.device | str = "cpu",
         with_bonus: bool = False,
+        frames: FrameShape | None = None,
     ) -> None:
+        self._frames = FrameRing(frames, num_envs, capacity, device) if frames else None
+        obs_dim = frames.stack if frames else obs_dim
         self._widths = [obs_dim, obs_dim, action_dim, 1, latent_dim, int(with_bonus), 1, 1, 1]
         self._num_envs = num_envs
         self._rows = capacity // num_envs
@@ -48,6 +55,8 @@ class SegmentReplay:
         self._head = 0  # next row to write
         self._filled = 0  # rows that hold data
         self._episode_step = torch.zeros(num_envs, 1, device=device)
+        # Of every row the oldest frame it needs: it is dropped when that one is.
+        self._needs = np.zeros(self._rows if frames else 0, dtype=np.int64)
         self._ends = sum(self._widths[:7])  # column: did the episode end (either way) after this step
 
     def __len__(self) -> int:
@@ -73,6 +82,8 @@ class SegmentReplay:
         ended_now = self._matrix(terminated, 1, "terminated")
         ended = ended_now + self._matrix(truncated, 1, "truncated") > 0
         row = self._data[self._head]
+        if self._frames is not None:
+            obs, next_obs = self._store_frames(self._frames, obs, next_obs)
         torch.cat(
             [
                 self._matrix(obs, obs_dim, "obs"),
@@ -91,6 +102,26 @@ class SegmentReplay:
         self._episode_step = torch.where(ended, 0.0, self._episode_step + 1)
         self._head = (self._head + 1) % self._rows
         self._filled = min(self._filled + 1, self._rows)
+        if self._frames is not None:
+            while self._needs[(self._head - self._filled) % self._rows] < self._frames.oldest:
+                self._filled -= 1
+
+    def _store_frames(
+        self, frames: FrameRing, obs: np.ndarray | Tensor, next_obs: np.ndarray | Tensor
+    ) -> tuple[Tensor, Tensor]:
+        begun = self._episode_step[:, 0] == 0
+        before, after, oldest = frames.store(frames.tensor(obs), frames.tensor(next_obs), begun)
+        self._needs[self._head] = oldest
+        return before, after
+
+    def observations(self, count: int) -> Tensor:
+        """Draw (count, obs_dim) stored observations, each the outcome of a transition."""
+        device = self._data.device
+        rows = torch.randint(self._filled, (count,), device=device) + (self._head - self._filled)
+        env = torch.randint(self._num_envs, (count,), device=device)
+        width = self._widths[0]
+        picked = self._data[rows % self._rows, env, width : 2 * width]
+        return picked if self._frames is None else self._frames.look_up(picked)
 
     def cut(self) -> None:
         """Close all running episodes as truncated: their environments could not be restored."""
@@ -133,8 +164,11 @@ class SegmentReplay:
         last = mask.sum(0, keepdim=True) - 1
         picked = picked.gather(0, torch.minimum(steps, last).unsqueeze(-1).expand_as(picked))
         obs, next_obs, action, reward, latent, bonus, terminated, _, step = picked.split(self._widths, dim=-1)
+        first = obs[0]
+        if self._frames is not None:
+            first, next_obs = self._frames.look_up(first), self._frames.look_up(next_obs)
         return SegmentBatch(
-            obs=obs[0],
+            obs=first,
             next_obs=next_obs,
             action=action,
             reward=reward.squeeze(-1),
@@ -146,11 +180,15 @@ class SegmentReplay:
         )
 
     def state_dict(self) -> dict[str, Any]:
-        """Tensors and plain data only; of the ring only what is filled."""
+        """Tensors and plain data only; of the ring only what is filled, oldest row first."""
+        rows = np.arange(self._head - self._filled, self._head) % self._rows
+        frames = {}
+        if self._frames is not None:
+            frames = self._frames.state_dict() | {"needs": torch.from_numpy(self._needs[rows])}
         return {
-            "data": self._data[: self._filled].clone(),
-            "head": self._head,
+            "data": self._data[torch.from_numpy(rows).to(self._data.device)],
             "episode_step": self._episode_step.clone(),
+            "frames": frames,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -161,8 +199,10 @@ class SegmentReplay:
                 f"replay: stored rows {tuple(data.shape)} do not fit into {tuple(self._data.shape)}; "
                 "resume with the same environment, latent space, num_envs and capacity"
             )
-        # Oldest row first, so that a full ring also fits into a larger one.
-        self._data[: len(data)] = data.roll(-state["head"], 0) if state["head"] < len(data) else data
+        self._data[: len(data)] = data  # so a full ring also fits into a larger one
+        if self._frames is not None:
+            self._frames.load_state_dict(state["frames"])
+            self._needs[: len(data)] = state["frames"]["needs"].numpy()
         self._filled = len(data)
         self._head = len(data) % self._rows
         self._episode_step.copy_(state["episode_step"])

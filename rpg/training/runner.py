@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -58,9 +60,13 @@ class Runner:
             )
         n = envs.num_envs
         self.num_envs = n
-        self._obs = np.zeros((n, agent.obs_dim), dtype=np.float32)
+        self._dtype = np.uint8 if agent.frames else np.float32
+        # A picture is seen beside those before it; at the start of an episode there is but one.
+        self._stack = agent.frames.stack if agent.frames else 1
+        self._obs = np.zeros((n, agent.obs_dim), dtype=self._dtype)
         self._latent = torch.zeros(n, agent.latent_dim, device=agent.device)
         self._started = np.zeros(n, dtype=np.int64)  # episodes begun, per environment
+        self._seeds = np.zeros(n, dtype=np.int64)  # of the running episodes
         self._return = np.zeros(n)
         self._length = np.zeros(n, dtype=np.int64)
         self._ever = np.zeros(n, dtype=np.bool_)
@@ -73,7 +79,7 @@ class Runner:
 
     @property
     def observations(self) -> np.ndarray:
-        """Current observations, (num_envs, obs_dim) float32."""
+        """Current observations, (num_envs, obs_dim) float32, of pictures uint8."""
         return self._obs
 
     def reset(self, mask: np.ndarray | None = None) -> None:
@@ -83,10 +89,13 @@ class Runner:
             int(np.random.SeedSequence((self._seed, i, int(k))).generate_state(1)[0])
             for i, k in enumerate(self._started)
         ]
-        obs, _ = self._envs.reset(seed=seeds, options={"reset_mask": mask.copy()})  # type: ignore[arg-type]
+        self._seeds[mask] = np.array(seeds, dtype=np.int64)[mask]
         self._started += mask
+        with self._watching_workers():
+            obs, _ = self._envs.reset(seed=seeds, options={"reset_mask": mask.copy()})  # type: ignore[arg-type]
         self._return[mask], self._length[mask], self._ever[mask] = 0.0, 0, False
-        self._obs = self._checked(obs)
+        first = np.tile(self._checked(obs), self._stack)
+        self._obs = first if self._stack == 1 else np.where(mask[:, None], first, self._obs)
         self._latent = self._agent.begin_episodes(self._tensor(self._obs), self._tensor(mask), self._latent)
 
     def step(self, deterministic: bool = False) -> tuple[Transition, list[Episode]]:
@@ -94,9 +103,12 @@ class Runner:
         action = self._agent.act(self._tensor(self._obs), self._latent, deterministic)
         sent = action.cpu().numpy()
         self._require_finite(sent, "action")
-        next_obs, reward, terminated, truncated, info = self._envs.step(sent)
+        with self._watching_workers():
+            next_obs, reward, terminated, truncated, info = self._envs.step(sent)
         self._steps += 1
         next_obs = self._checked(next_obs)
+        if self._stack > 1:
+            next_obs = np.concatenate([self._obs[:, next_obs.shape[1] :], next_obs], axis=1)
         self._require_finite(reward, "reward")
         transition = Transition(self._obs, action, reward, next_obs, terminated, truncated, self._latent)
         success = np.asarray(info.get("success", info.get("is_success", np.zeros(self.num_envs)))) > 0
@@ -113,12 +125,41 @@ class Runner:
             self.reset(ended)
         return transition, episodes
 
+    @contextmanager
+    def _watching_workers(self) -> Iterator[None]:
+        """Say which task died where, if a process that steps one did.
+
+        Raises:
+            RPGError: it did.
+        """
+        try:
+            yield
+        except (EOFError, ConnectionError) as error:
+            workers = getattr(self._envs, "processes", [])
+            for worker in workers:
+                worker.join(1.0)  # its exit code comes a moment after its pipe closed
+            codes = [worker.exitcode for worker in workers]
+            for worker in workers:
+                worker.terminate()
+            self._envs.closed = True  # closing would wait for answers that never come
+            dead = [i for i, code in enumerate(codes) if code is not None]
+            where = "; ".join(
+                f"environment {i} (exit code {codes[i]}) after step {int(self._length[i])} of episode "
+                f"{int(self._started[i])}, seed {int(self._seeds[i])}"
+                for i in dead
+            )
+            raise RPGError(
+                f"{self._name}: a worker process died: {where or error}; the last checkpoint is untouched, "
+                "the same command goes on from there"
+            ) from error
+
     def _tensor(self, array: np.ndarray) -> Tensor:
         return torch.as_tensor(array, device=self._agent.device)
 
     def _checked(self, obs: np.ndarray) -> np.ndarray:
-        obs = np.asarray(obs, dtype=np.float32).reshape(self.num_envs, -1)
-        self._require_finite(obs, "observation")
+        obs = np.asarray(obs, dtype=self._dtype).reshape(self.num_envs, -1)
+        if self._dtype == np.float32:
+            self._require_finite(obs, "observation")
         return obs
 
     def _require_finite(self, values: np.ndarray, what: str) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from rpg.training.config import TrainerConfig
 from rpg.training.loggers import Loggers
 from rpg.training.replay import SegmentReplay
 from rpg.training.runner import Episode, Runner, evaluate, summarize
+from rpg.training.video import film
 
 Row = dict[str, float | int | str]
 
@@ -36,6 +38,7 @@ class Trainer:
         exploration: bonus on sampled segments; None for none.
         envs: training environments.
         eval_envs: makes a separate batch for evaluation when first needed.
+        film_envs: makes a single environment that draws, for videos.
         config: the loop.
         run_dir: logs, pictures and the checkpoint go here.
         loggers: where rows and pictures go.
@@ -58,10 +61,12 @@ class Trainer:
         plain_config: dict[str, Any] | None = None,
         env_name: str = "env",
         action_repeat: int = 1,
+        film_envs: Callable[[], VectorEnv[Any, Any, Any]] | None = None,
     ) -> None:
         self.agent, self.exploration, self.config = agent, exploration, config
         self.checkpoint_path = run_dir / "checkpoint.pt"
-        self._make_eval_envs = eval_envs
+        self._make_eval_envs, self._make_film_envs = eval_envs, film_envs
+        self._run_dir = run_dir
         self._eval_envs: VectorEnv[Any, Any, Any] | None = None
         self._loggers, self._seed, self._plain = loggers, seed, plain_config or {}
         self._env_name, self._repeat = env_name, action_repeat
@@ -75,6 +80,7 @@ class Trainer:
             config.replay_capacity,
             agent.device,
             with_bonus=exploration is not None and not exploration.config.relabel,
+            frames=agent.frames,
         )
         self._tracker = envs.make_tracker() if isinstance(envs, Tracked) else None
         self.decisions = self.updates = self._ticks = 0
@@ -127,6 +133,8 @@ class Trainer:
                 self.learn_once()
             if self._due(self.config.eval_every):
                 self._evaluate()
+            if self._due(self.config.video_every):
+                self.film()
             if self._due(self.config.log_every):
                 on_row(self._log())
             finished = self.env_steps >= self.config.steps  # then both follow below
@@ -191,7 +199,7 @@ class Trainer:
     def learn_once(self) -> None:
         """One update of the exploration bonus and, once enough is stored, of the agent."""
         if self.exploration is not None and self.exploration.ready:
-            self._add(self.exploration.update())
+            self._add(self.exploration.update(self._replay.observations))
         if self.decisions > self.config.seed_decisions:
             self.update_agent()
 
@@ -267,6 +275,14 @@ class Trainer:
         picture = self._tracker.picture() if self._tracker is not None else None
         if picture is not None:
             self._loggers.picture("progress", picture, self.env_steps)
+
+    def film(self) -> None:
+        """Write a video of an evaluation episode into the run folder, if there is an environment for it."""
+        if self._make_film_envs is None:
+            return
+        with closing(self._make_film_envs()) as envs:
+            path = self._run_dir / "videos" / f"{self.env_steps:09d}.mp4"
+            film(self.agent, envs, path, 1, self._seed + _EVALUATION_SEED, name=self._env_name)
 
     # -- survive ---------------------------------------------------------------------------------------
 

@@ -15,6 +15,7 @@ class WorldModelConfig:
     Args:
         state_dim: width of the latent state s.
         width: hidden width of every MLP and of the GRU.
+        channels: of the convolutions, where observations are pictures.
         dynamics: ``gru`` (published) or ``residual``, s' = norm(s + f(s, a)), a quarter of its work.
         activation: of every MLP, policy and posterior included: ``elu`` (published), ``silu`` or ``relu``.
         critic: ``v`` composes Q(s, a, z) = r(s', a) + gamma V(s', z) as the published code does;
@@ -32,6 +33,7 @@ class WorldModelConfig:
 
     state_dim: int = 100
     width: int = 256
+    channels: int = 128
     dynamics: str = "gru"
     activation: str = "elu"
     critic: str = "v"
@@ -51,7 +53,7 @@ class WorldModelConfig:
             raise RPGError(f"world_model.dynamics={self.dynamics!r}: choose 'gru' or 'residual'")
         if self.activation not in ACTIVATIONS:
             raise RPGError(f"world_model.activation={self.activation!r}: choose {', '.join(ACTIVATIONS)}")
-        for name in ("state_dim", "width", "horizon", "target_every"):
+        for name in ("state_dim", "width", "channels", "horizon", "target_every"):
             if getattr(self, name) < 1:
                 raise RPGError(f"world_model.{name}={getattr(self, name)}: must be at least 1")
         if self.lr <= 0 or self.grad_clip <= 0 or not 0 < self.target_rate <= 1:

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from rpg.networks import TwinMLP, mlp
+from rpg.pixels import FrameShape, pixel_encoder
 from rpg.world_model.config import WorldModelConfig
 from rpg.world_model.dynamics import DYNAMICS, GRUDynamics, ResidualDynamics
 
@@ -16,17 +17,23 @@ class WorldModel(nn.Module):
     The reward head looks at the state *reached*.
 
     Args:
-        input_dim: width of the (already scaled and encoded) observation.
+        inputs: width of the (already scaled and encoded) observation, or the shape of pictures.
         action_dim: number of action dimensions.
         latent_dim: width of z, which only the value heads see.
         config: sizes.
     """
 
-    def __init__(self, input_dim: int, action_dim: int, latent_dim: int, config: WorldModelConfig) -> None:
+    def __init__(
+        self, inputs: int | FrameShape, action_dim: int, latent_dim: int, config: WorldModelConfig
+    ) -> None:
         super().__init__()
         state, width, act = config.state_dim, config.width, config.activation
         self.critic = config.critic
-        self.encoder = mlp(input_dim, width, state, act)
+        self.encoder = (
+            pixel_encoder(inputs, config.channels, width, state, act)
+            if isinstance(inputs, FrameShape)
+            else mlp(inputs, width, state, act)
+        )
         self.dynamics: GRUDynamics | ResidualDynamics = DYNAMICS[config.dynamics](action_dim, config)
         embedded = self.dynamics.embedded_dim
         self.reward_head = mlp(state + embedded, width, 1, act)

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import time
@@ -169,7 +170,7 @@ def test_what_a_crashed_process_logged_is_not_logged_twice(
 def test_a_simulator_without_state_goes_on_with_new_episodes_and_says_so(
     composed: Composed, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    cfg = composed(*SHORT, "env=gym", "env.id=Pendulum-v1", "env.num_envs=2", "trainer.eval_every=0")
+    cfg = composed(*SHORT, "env=gymnasium", "env.id=Pendulum-v1", "env.num_envs=2", "trainer.eval_every=0")
     stopped = interrupt(cfg, at=234)  # 117 steps into the first episodes
     capsys.readouterr()
     last = train(cfg)
@@ -232,3 +233,50 @@ def test_the_command_survives_kills_and_signals_at_any_moment(
         assert "Traceback" not in err
     assert train(composed(*REAL))["env_steps"] == 1200
     assert_equal_runs(run, straight_real)
+
+
+WORKERS = (
+    "agent=random", "env=gymnasium", "env.id=Pendulum-v1", "env.num_envs=2", "env.asynchronous=true",
+    "trainer.steps=1000000", "trainer.log_every=200", "trainer.checkpoint_every=400", "trainer.eval_every=0",
+)  # fmt: skip
+
+
+def test_ctrl_c_reaches_worker_processes_too_and_the_run_is_saved(command: Command, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    process = command("rpg.train", f"run_dir={run}", "device=cpu", "logger=files", *WORKERS)
+    wait_for_rows(process, run, 3)
+    for pid in (process.pid, *children(process.pid)):  # as a terminal does
+        os.kill(pid, signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 130, err
+    assert "stopped by Ctrl-C" in out
+    assert "Traceback" not in err
+    assert load_checkpoint(run / "checkpoint.pt")["env_steps"] >= 600
+
+
+def test_a_killed_worker_ends_the_run_with_one_line_and_leaves_the_checkpoint(
+    command: Command, tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    process = command("rpg.train", f"run_dir={run}", "device=cpu", "logger=files", *WORKERS)
+    wait_for_rows(process, run, 3)
+    os.kill(
+        next(pid for pid in children(process.pid) if "forkserver" in command_line(pid) and not children(pid)),
+        signal.SIGKILL,
+    )
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 2, err
+    assert "Pendulum-v1: a worker process died: environment " in err
+    assert "(exit code -9) after step " in err
+    assert "Traceback" not in err
+    assert load_checkpoint(run / "checkpoint.pt")["env_steps"] >= 400
+
+
+def children(pid: int) -> list[int]:
+    """All that descend from it."""
+    listed = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    return [found for child in map(int, listed) for found in (child, *children(child))]
+
+
+def command_line(pid: int) -> str:
+    return Path(f"/proc/{pid}/cmdline").read_text()

@@ -1,6 +1,9 @@
 from __future__ import annotations
 
+import os
+import signal
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -8,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.spaces import Box
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from torch import Tensor
 
 from rpg.agents import Agent
@@ -309,3 +312,33 @@ def test_evaluation_starts_afresh_whatever_was_played_before() -> None:
     first = evaluate(agent, envs, 4, seed=0, deterministic=True)
     envs.step(np.zeros((2, 1), np.float32))
     assert evaluate(agent, envs, 4, seed=0, deterministic=True) == first
+
+
+class Deadly(Clock):
+    """Its process is killed at step 3 of the episode, if it is the second environment."""
+
+    def __init__(self, deadly: bool) -> None:
+        super().__init__(length=5)
+        self.deadly = deadly
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        if self.deadly and self.t == 2:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().step(action)
+
+
+def test_a_dead_worker_is_named_with_its_episode() -> None:
+    envs = AsyncVectorEnv(
+        [partial(Deadly, deadly) for deadly in (False, True)], autoreset_mode=AutoresetMode.DISABLED
+    )
+    agent = Still(envs.single_observation_space, envs.single_action_space)
+    runner = Runner(agent, envs, seed=3, name="clock")
+    runner.reset()
+    for _ in range(2):
+        runner.step()
+    message = (
+        r"clock: a worker process died: environment 1 \(exit code -9\) after step 2 of episode 1, seed \d+;"
+    )
+    with pytest.raises(RPGError, match=message):
+        runner.step()
+    assert envs.closed
