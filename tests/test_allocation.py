@@ -15,12 +15,12 @@ if sys.argv[1] == "keep":
     assert keep_freed_memory()
 def faults():
     return resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-x = torch.ones(2000, 256)
-for repeat in range(60):
-    if repeat == 30:
+x = torch.ones(10_000, 1024)  # 41 MB: more than glibc ever learns to keep by itself
+for repeat in range(20):
+    if repeat == 10:
         before = faults()
-    kept = [torch.relu(x) for _ in range(10)]
-    del kept
+    y = torch.relu(x)
+    del y
 print(faults() - before)
 """
 
@@ -33,5 +33,5 @@ def page_faults(how: str) -> int:
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the settings are those of glibc")
 def test_freed_memory_is_not_mapped_anew() -> None:
     plain, kept = page_faults("plain"), page_faults("keep")
-    assert plain > 30 * 400, "nothing to gain here: the test would pass without the settings"
+    assert plain > 10 * 1000, "nothing to gain here: the test would pass without the settings"
     assert kept < plain / 10

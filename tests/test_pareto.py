@@ -278,7 +278,7 @@ def test_gather_and_draw_from_finished_runs(
         for steps in ("20000", "40000")
     ]
     assert (rows[0]["knob"], rows[-1]["knob"]) == ("", names[1].rpartition("-")[0])
-    assert (rows[-1]["wall_s"], rows[-1]["accuracy"], rows[-1]["updates"]) == ("200.0", "0.9", "8000")
+    assert (rows[-1]["wall_s"], rows[-1]["accuracy"], rows[-1]["updates"]) == ("200.00", "0.9", "8000")
     assert 0 < float(rows[0]["gflop_per_update"]) < float(rows[-1]["gflop_per_update"])
     origin = json.loads(Path("results/pareto/learning.json").read_text())
     assert origin["commit"] == ["abc", "def"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes.util
+import logging
 import os
 import sys
 from functools import cache
@@ -17,6 +18,9 @@ def prefer_offscreen_gl() -> None:
     is MuJoCo's own choice where neither library is there: only pictures would fail then.
     """
     screen = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    logging.getLogger("OpenGL").setLevel(
+        logging.WARNING
+    )  # it tells of every accelerator that is not installed
     if sys.platform != "linux" or screen or "MUJOCO_GL" in os.environ:
         return
     if Path("/dev/nvidiactl").exists() and ctypes.util.find_library("EGL"):

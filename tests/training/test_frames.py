@@ -171,8 +171,8 @@ def test_a_run_on_pictures_trains_saves_and_goes_on(composed: Any, tmp_path: Pat
     gym.register("Dot-v0", entry_point=Dot, max_episode_steps=20)
     overrides = [
         "experiment=debug", "env=gymnasium", "env.id=Dot-v0", "env.frame_stack=2", "env.num_envs=2",
-        "size.channels=8", "trainer.replay_capacity=300", "trainer.eval_every=0", f"agent.prior.mode={mode}",
-        f"run_dir={tmp_path}", "logger=files",
+        "size.channels=8", "trainer.decisions_per_update=4", "trainer.replay_capacity=300", "trainer.eval_every=0",
+        f"agent.prior.mode={mode}", f"run_dir={tmp_path}", "logger=files",
     ]  # fmt: skip
     try:
         train(composed(*overrides, "trainer.steps=300"))
