@@ -14,9 +14,9 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
-from hydra import compose, initialize_config_module
 
 from rpg.cli import check_overrides
+from rpg.conf import compose_config
 from rpg.errors import RPGError
 from rpg.provenance import commit, cpu_name
 from rpg.training.build import build_trainer, parse_config
@@ -86,8 +86,7 @@ def started(
             *args.overrides, *overrides, f"run_dir={folder}",
         ]  # fmt: skip
         check_overrides(texts)
-        with initialize_config_module("rpg.conf", version_base="1.3"):
-            run = parse_config(compose("config", overrides=texts))
+        run = parse_config(compose_config(*texts))
         with closing(build_trainer(run)) as trainer:
             trainer.start()
             yield trainer, run

@@ -24,14 +24,13 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from hydra import compose, initialize_config_module
 
 from rpg.cli import report_errors
 from rpg.envs.config import EnvConfig
 from rpg.envs.make import make_envs
 from rpg.errors import RPGError, nearest
 from rpg.provenance import simulator_versions
-from rpg.training.build import parse_config
+from rpg.training.build import env_preset
 
 COLUMNS = ["task", "workers", "raw_steps_s", "ours_steps_s", "overhead_pct", "overhead_us", "versions"]
 Stepper = Callable[[np.ndarray], object]
@@ -92,12 +91,6 @@ RAW: dict[str, Callable[[gym.Env[Any, Any]], Stepper]] = {
     "mujoco_humanoid": suite("Humanoid-v5"),
 }
 OTHERS = ("block_push", "visual_block_push", "cabinet_dense", "cabinet_sparse")  # have no step but ours
-
-
-def config_of(task: str) -> EnvConfig:
-    """The environment's section of the config."""
-    with initialize_config_module("rpg.conf", version_base="1.3"):
-        return parse_config(compose("config", overrides=[f"env={task}", "device=cpu", "run_dir=unused"])).env
 
 
 def per_second(step: Stepper, actions: np.ndarray) -> float:
@@ -182,7 +175,7 @@ def main(argv: list[str] | None = None) -> None:
         writer = csv.DictWriter(sys.stdout, COLUMNS, lineterminator="\n")
         writer.writeheader()
         for task in args.tasks or known:
-            config = config_of(task)
+            config = env_preset(task)
             measured = [alone(task, config, args.decisions, args.repeats)]
             measured += [together(config, workers, args.decisions) for workers in args.workers]
             for row in measured:

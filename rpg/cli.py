@@ -11,7 +11,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from hydra import compose, initialize_config_module
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -22,6 +21,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from rpg.conf import compose_config
 from rpg.errors import RPGError, nearest
 
 INTERRUPTED = 130  # exit code after Ctrl-C
@@ -85,8 +85,12 @@ def command_line() -> str:
     return shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
 
 
-def check_overrides(args: list[str]) -> None:
+def check_overrides(args: list[str], config: str = "config") -> None:
     """Check every ``key=value`` before Hydra starts, so that a typo costs nothing and explains itself.
+
+    Args:
+        args: of the command line.
+        config: name of the command's config.
 
     Raises:
         RPGError: a malformed override, an unknown group option or an unknown key.
@@ -112,7 +116,7 @@ def check_overrides(args: list[str]) -> None:
     sweeps = [text for override, text in zip(overrides, texts, strict=True) if override.is_sweep_override()]
     if sweeps and not is_sweep(args):
         raise RPGError(f"{sweeps[0]}: several values make a sweep; add -m, or quote a list as [a,b]")
-    base = _compose([f"{o.key_or_group}={_values(o)[0]}" for o in chosen])
+    base = _compose([f"{o.key_or_group}={_values(o)[0]}" for o in chosen], config)
     for override in overrides:
         if override.key_or_group in groups or override.is_hydra_override():
             continue
@@ -122,7 +126,7 @@ def check_overrides(args: list[str]) -> None:
         text for override, text in zip(overrides, texts, strict=True) if not override.is_sweep_override()
     ]
     removed = [a for a in args if a.startswith("~")]
-    cfg = _compose([*single, *removed])
+    cfg = _compose([*single, *removed], config)
     # Hydra names the folder after the overrides of our keys, not after its own.
     named = ",".join(
         text
@@ -181,10 +185,9 @@ def _values(override: Override) -> list[Any]:
     return ["null" if value is None else value]
 
 
-def _compose(overrides: list[str]) -> DictConfig:
+def _compose(overrides: list[str], config: str) -> DictConfig:
     try:
-        with initialize_config_module("rpg.conf", version_base="1.3"):
-            return compose("config", overrides=overrides)
+        return compose_config(*overrides, config=config)
     except (HydraException, OmegaConfBaseException, ValueError) as error:
         raise RPGError(f"config: {str(error).strip().splitlines()[0]}") from error
 

@@ -21,7 +21,7 @@ from hydra import compose, initialize_config_module
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import CompactHydraException
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from rpg.cli import INTERRUPTED, brings_configs, report_errors
 from rpg.errors import RPGError
@@ -56,12 +56,16 @@ def attempt(train: Callable[[DictConfig], dict[str, Any]], cfg: DictConfig) -> d
     raise CompactHydraException(f"{cfg.run_dir}: {message}")  # fails this job alone
 
 
-def sweep(job: Callable[[], None], args: list[str]) -> None:
+def sweep(
+    job: Callable[[], None], args: list[str], config: str = "config", length: str = "trainer.steps"
+) -> None:
     """Let Hydra run the sweep that ``args`` ask for, then say what became of each run and exit.
 
     Args:
         job: the function that Hydra made, to be called without arguments.
         args: the command line.
+        config: name of the command's config.
+        length: its key that says how long a run is.
     """
     code: Any = 0
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # else joblib's workers would stay behind
@@ -72,11 +76,13 @@ def sweep(job: Callable[[], None], args: list[str]) -> None:
         code = end.code
     if code != INTERRUPTED and not brings_configs(args):
         with report_errors():
-            _report(planned_runs(args))
+            _report(planned_runs(args, config, length))
     sys.exit(code)
 
 
-def planned_runs(args: list[str]) -> list[tuple[Path, int]]:
+def planned_runs(
+    args: list[str], config: str = "config", length: str = "trainer.steps"
+) -> list[tuple[Path, int]]:
     """Folder and last env step of every run of a sweep."""
     texts = [a for a in args if not a.startswith("-") and ("=" in a or a.startswith("~"))]
     overrides = OverridesParser.create().parse_overrides(texts)
@@ -89,9 +95,9 @@ def planned_runs(args: list[str]) -> list[tuple[Path, int]]:
     runs = []
     with initialize_config_module("rpg.conf", version_base="1.3"):
         for chosen in itertools.product(*choices):
-            cfg = compose("config", overrides=list(chosen), return_hydra_config=True)
+            cfg = compose(config, overrides=list(chosen), return_hydra_config=True)
             HydraConfig.instance().set_config(cfg)  # run_dir has the folder's name from there
-            runs.append((Path(cfg.run_dir), int(cfg.trainer.steps)))
+            runs.append((Path(cfg.run_dir), int(OmegaConf.select(cfg, length))))
     return runs
 
 

@@ -26,11 +26,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 from side_by_side import Job, run_side_by_side, write_table
 
 from rpg import pareto
+from rpg.conf import compose_config
 from rpg.errors import RPGError, nearest
 from rpg.plot import Run, aggregate, group_runs, load_run
 from rpg.provenance import provenance
@@ -102,8 +102,7 @@ class Config:
 
 def configs() -> dict[str, Config]:
     """Every configuration by name, in order."""
-    with initialize_config_module("rpg.conf", version_base="1.3"):
-        fast = compose("config", overrides=[*_COMMON, "env=maze"])
+    fast = compose_config(*_COMMON, "env=maze")
     every = [Config("fast")]
     for knob, about in KNOBS.items():
         own = OmegaConf.select(fast, about.key)

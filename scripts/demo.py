@@ -17,10 +17,10 @@ from contextlib import closing
 from pathlib import Path
 
 import numpy as np
-from hydra import compose, initialize_config_module
 
 from rpg import compiling
 from rpg.cli import report_errors
+from rpg.conf import compose_config
 from rpg.errors import RPGError
 from rpg.train import assemble
 
@@ -43,8 +43,7 @@ def main() -> int:
     if (_RUN / "verdict.json").exists():
         shutil.rmtree(_RUN)
     with report_errors():
-        with initialize_config_module("rpg.conf", version_base="1.3"):
-            cfg = compose("config", overrides=["experiment=demo", *sys.argv[1:]])
+        cfg = compose_config("experiment=demo", *sys.argv[1:])
         trainer, progress = assemble(cfg)
         start = time.perf_counter()
         with closing(trainer), progress:

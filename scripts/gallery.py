@@ -15,7 +15,6 @@ from contextlib import closing
 from pathlib import Path
 
 import numpy as np
-from hydra import compose, initialize_config_module
 from numpy.typing import NDArray
 
 import rpg.conf
@@ -23,7 +22,7 @@ from rpg.envs.config import EnvConfig
 from rpg.envs.make import make_envs
 from rpg.errors import RPGError
 from rpg.figures import new_figure, save
-from rpg.training.build import parse_config
+from rpg.training.build import env_preset
 
 _GENERIC = {"gymnasium", "gymnasium_robotics", "metaworld", "maniskill", "bandit"}
 _COLUMNS = 5
@@ -34,14 +33,6 @@ def presets() -> list[str]:
     """Every task of its own, by name."""
     folder = Path(rpg.conf.__file__).parent / "env"
     return sorted(path.stem for path in folder.glob("*.yaml") if path.stem not in _GENERIC)
-
-
-def config_of(preset: str) -> EnvConfig:
-    """The environment's section of the config."""
-    with initialize_config_module("rpg.conf", version_base="1.3"):
-        return parse_config(
-            compose("config", overrides=[f"env={preset}", "device=cpu", "run_dir=unused"])
-        ).env
 
 
 def portrait(config: EnvConfig, steps: int) -> Frame:
@@ -71,7 +62,7 @@ def main(argv: list[str] | None = None) -> int:
     pictures: dict[str, Frame] = {}
     for preset in args.presets or presets():
         try:
-            pictures[preset] = portrait(config_of(preset), args.steps)
+            pictures[preset] = portrait(env_preset(preset), args.steps)
         except RPGError as error:
             print(f"left out: {error}", file=sys.stderr)
     if not pictures:

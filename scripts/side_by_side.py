@@ -41,7 +41,12 @@ def run_side_by_side(jobs: Sequence[Job], count: int) -> int:
         return done.returncode != 0
 
     with ThreadPoolExecutor(count) as pool:
-        return sum(pool.map(one, jobs))
+        running = [pool.submit(one, job) for job in jobs]
+        try:
+            return sum(job.result() for job in running)
+        except KeyboardInterrupt:  # which the runs got as well, and save themselves
+            pool.shutdown(cancel_futures=True)
+            raise
 
 
 def write_table(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:

@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 import torch
-from hydra import compose, initialize_config_module
 from omegaconf import DictConfig
 
 import rpg
+from rpg.conf import compose_config
 
 torch.set_num_threads(1)
 
@@ -22,10 +22,7 @@ def composed(tmp_path: Path) -> Callable[..., DictConfig]:
     """``composed("agent=mbsac", ...)``: the config as the command line makes it, in the folder ``tmp_path / "run"``."""
 
     def make(*overrides: str) -> DictConfig:
-        with initialize_config_module("rpg.conf", version_base="1.3"):
-            return compose(
-                "config", [f"run_dir={tmp_path / 'run'}", "device=cpu", "logger=files", *overrides]
-            )
+        return compose_config(f"run_dir={tmp_path / 'run'}", "device=cpu", "logger=files", *overrides)
 
     return make
 

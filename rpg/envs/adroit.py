@@ -12,14 +12,13 @@ import math
 from abc import ABC, abstractmethod
 from typing import Any
 
-import gymnasium
 import mujoco
 import numpy as np
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
 from rpg.envs.checks import checked_action
-from rpg.envs.mujoco_picture import Frame, MujocoPicture, View
+from rpg.envs.mujoco_picture import PicturedSimulation, View
 from rpg.errors import NonFiniteError, RPGError
 from rpg.exploration.objects import ObjectsOfInterest
 
@@ -36,7 +35,7 @@ _MAX_SPEED = 1.0  # of the hammer in the observation, m/s and rad/s
 _GIMBAL = 4 * np.finfo(np.float64).eps
 
 
-class AdroitTask(gymnasium.Env[Array, Array], ABC):
+class AdroitTask(PicturedSimulation, ABC):
     """What both tasks share: actions, repeats, rewards, the start and pictures.
 
     Args:
@@ -68,24 +67,16 @@ class AdroitTask(gymnasium.Env[Array, Array], ABC):
         camera: str | None,
         render_size: int,
     ) -> None:
-        if render_mode not in (None, "rgb_array"):
-            raise RPGError(f"{name}: render_mode '{render_mode}' is unknown; use 'rgb_array' or None")
         if action_repeat < 1:
             raise RPGError(f"{name}: action_repeat {action_repeat} must be at least 1")
+        super().__init__(name, simulation.model, simulation.data, render_mode, camera, render_size, self.view)
         self.simulation = simulation
-        self.model: Any = simulation.model
-        self.data: Any = simulation.data
-        # MuJoCo would put a diverged simulation back to its start and go on; we want to know.
-        self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
-
-        self.render_mode = render_mode
         self.action_repeat = action_repeat
         self.metadata = self.metadata | {"render_fps": round(1 / (simulation.dt * action_repeat))}
         self.objects_of_interest = ObjectsOfInterest.of(objects, scale=1 / OBS_SCALE)
         self.action_space = Box(-1.0, 1.0, (int(self.model.nu),), np.float32)
         self.observation_space = Box(-np.inf, np.inf, (obs_dim,), np.float32)
 
-        self._name = name
         self._action_dim = int(self.model.nu)
         self._substeps = int(simulation.frame_skip)
         self._middle, self._half_range = simulation.act_mean, simulation.act_rng
@@ -94,7 +85,6 @@ class AdroitTask(gymnasium.Env[Array, Array], ABC):
         self._palm = self._site("S_grasp")
         self._buffer = np.zeros(obs_dim)
         self._decisions = 0
-        self._picture = MujocoPicture(name, self.model, self.data, camera, self.view, render_size)
 
     @abstractmethod
     def _achieved(self) -> bool:
@@ -135,17 +125,9 @@ class AdroitTask(gymnasium.Env[Array, Array], ABC):
         reward = reached / self.action_repeat
         return self._observe(), reward, False, False, {"success": achieved}
 
-    def render(self) -> Frame | None:
-        """A uint8 (render_size, render_size, 3) RGB picture, or None without a render mode.
-
-        Raises:
-            RPGError: there is no OpenGL to draw with.
-        """
-        return None if self.render_mode is None else self._picture.draw()
-
     def close(self) -> None:
-        """Free the renderer, if one was opened."""
-        self._picture.close()
+        """Free simulation and renderer."""
+        super().close()
         self.simulation.close()
 
     def _observe(self) -> Array:

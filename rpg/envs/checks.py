@@ -10,6 +10,17 @@ from numpy.typing import ArrayLike, NDArray
 from rpg.errors import NonFiniteError, RPGError
 
 
+def checked_render_mode(name: str, render_mode: str | None) -> str | None:
+    """``render_mode`` as it was given: "rgb_array" or None.
+
+    Raises:
+        RPGError: anything else.
+    """
+    if render_mode not in (None, "rgb_array"):
+        raise RPGError(f"{name}: render_mode '{render_mode}' is unknown; use 'rgb_array' or None")
+    return render_mode
+
+
 def checked_action(name: str, action: ArrayLike, dim: int) -> NDArray[Any]:
     """``action`` as (dim,) float64, clipped to [-1, 1].
 

@@ -49,7 +49,7 @@ def make_envs(
             num_envs=num_envs,
             vectorization_mode="async" if apart else "sync",
             vector_kwargs={"autoreset_mode": AutoresetMode.DISABLED}
-            | ({"context": _clean()} if apart else {}),
+            | ({"context": _worker_start()} if apart else {}),
             wrappers=[partial(_adapted, repeat=config.action_repeat)],  # type: ignore[list-item]  # or none
             **kwargs,
         )
@@ -69,7 +69,7 @@ def make_envs(
         ) from error
 
 
-def _clean() -> str:
+def _worker_start() -> str:
     """How worker processes begin: from one without threads, locks or graphics of this one.
 
     A plain fork copies locks that threads of torch or of a renderer hold, and would wait for them for ever.

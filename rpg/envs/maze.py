@@ -11,6 +11,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from rpg.envs.checks import checked_render_mode
 from rpg.envs.layouts import LAYOUTS, MazeLayout
 from rpg.envs.maze_picture import Frame, MazeCanvas
 from rpg.envs.maze_tracker import MazeTracker
@@ -134,13 +135,11 @@ class MazeVectorEnv(VectorEnv[Array, Array, Array]):
             raise RPGError(
                 f"maze: num_envs {num_envs} and episode_steps {self.episode_steps} must be at least 1"
             )
-        if render_mode not in (None, "rgb_array"):
-            raise RPGError(f"maze: render_mode '{render_mode}' is unknown; use 'rgb_array' or None")
         self.goal = None if goal is None else _checked_goal(goal, layout)
         if not goal_radius > 0:
             raise RPGError(f"maze: goal_radius {goal_radius} must be positive")
         self.goal_radius = goal_radius
-        self.render_mode = render_mode
+        self.render_mode = checked_render_mode("maze", render_mode)
 
         half = np.float32(layout.half_size)
         self.single_observation_space = Box(-half, half, (2,), np.float32)

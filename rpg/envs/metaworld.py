@@ -11,7 +11,6 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
-import gymnasium
 import mujoco
 import numpy as np
 from gymnasium.envs.mujoco import MujocoEnv
@@ -20,7 +19,7 @@ from metaworld.env_dict import ALL_V3_ENVIRONMENTS
 from numpy.typing import NDArray
 
 from rpg.envs.checks import checked_action
-from rpg.envs.mujoco_picture import Frame, MujocoPicture, View
+from rpg.envs.mujoco_picture import PicturedSimulation, View
 from rpg.errors import NonFiniteError, RPGError, nearest
 from rpg.exploration.objects import ObjectsOfInterest
 
@@ -50,7 +49,7 @@ def symlog(x: Floats) -> Floats:
     return compressed
 
 
-class MetaWorldEnv(gymnasium.Env[Array, Array]):
+class MetaWorldEnv(PicturedSimulation):
     """One task of Meta-World (``rpg/MetaWorld-v0``).
 
     Observation (39 + k,) float32, everything times 0.05: Meta-World's own 39 numbers with the goal visible, then
@@ -94,26 +93,23 @@ class MetaWorldEnv(gymnasium.Env[Array, Array]):
             raise RPGError(f"metaworld: unknown task '{task}': {nearest(task, ALL_V3_ENVIRONMENTS)}")
         if reward not in ("sparse", "dense"):
             raise RPGError(f"metaworld {task}: reward '{reward}' is unknown; use 'sparse' or 'dense'")
-        if render_mode not in (None, "rgb_array"):
-            raise RPGError(
-                f"metaworld {task}: render_mode '{render_mode}' is unknown; use 'rgb_array' or None"
-            )
         if action_repeat < 1:
             raise RPGError(f"metaworld {task}: action_repeat {action_repeat} must be at least 1")
-        self._name = f"metaworld {task}"
+        self.simulation = _simulation(task)
+        super().__init__(
+            f"metaworld {task}",
+            self.simulation.model,
+            self.simulation.data,
+            render_mode,
+            camera,
+            render_size,
+            _VIEW,
+        )
         self._settles_anew = task.removesuffix("-v3") in _SETTLE_ANEW
         self._dense = reward == "dense"
-        self.simulation = _simulation(task)
-        self.model: Any = self.simulation.model
-        self.data: Any = self.simulation.data
-        # MuJoCo would put a diverged simulation back to its start and go on; we want to know.
-        self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
-
-        self.render_mode = render_mode
         self.action_repeat = action_repeat
         self.metadata = self.metadata | {"render_fps": round(1 / (self.simulation.dt * action_repeat))}
         self._decisions = 0
-        self._picture = MujocoPicture(self._name, self.model, self.data, camera, _VIEW, render_size)
         self._keep_views()
 
         # What the two published tasks need is read straight from the simulator; the suite takes longer for it than
@@ -208,17 +204,9 @@ class MetaWorldEnv(gymnasium.Env[Array, Array]):
             total = float(success)
         return self._observe(), total, False, False, {"success": success}
 
-    def render(self) -> Frame | None:
-        """A uint8 (render_size, render_size, 3) RGB picture, or None without a render mode.
-
-        Raises:
-            RPGError: there is no OpenGL to draw with.
-        """
-        return None if self.render_mode is None else self._picture.draw()
-
     def close(self) -> None:
-        """Free the renderer, if one was opened."""
-        self._picture.close()
+        """Free simulation and renderer."""
+        super().close()
         self.simulation.close()
 
     def _read(self) -> None:

@@ -6,8 +6,14 @@ import gymnasium
 
 from rpg.envs.bandit import register_bandit
 from rpg.envs.mujoco.registration import register_mujoco
-from rpg.envs.robotics_ids import register_adroit, register_metaworld
 from rpg.envs.sapien.registration import register_sapien
+
+_ROBOTICS = {
+    "rpg/AdroitDoor-v0": ("rpg.envs.adroit:AdroitDoorEnv", 100),
+    "rpg/AdroitHammer-v0": ("rpg.envs.adroit:AdroitHammerEnv", 125),
+    "rpg/MetaWorld-v0": ("rpg.envs.metaworld:MetaWorldEnv", 100),
+}
+"""Environment id -> class, decisions to an episode."""
 
 MAZES = {
     "rpg/GapMaze-v1": "gap_v1",
@@ -24,9 +30,15 @@ def register_all() -> None:
     """Register every environment with gymnasium; safe to call again. Nothing heavy is imported."""
     register_bandit()
     register_mujoco()
-    register_adroit()
-    register_metaworld()
     register_sapien()
+    for env_id, (entry_point, horizon) in _ROBOTICS.items():
+        if env_id not in gymnasium.registry:
+            gymnasium.register(
+                env_id,
+                entry_point=entry_point,
+                max_episode_steps=horizon,
+                disable_env_checker=True,  # the environments check their own input
+            )
     for env_id, layout in MAZES.items():
         if env_id not in gymnasium.registry:
             gymnasium.register(

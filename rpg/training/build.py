@@ -14,6 +14,7 @@ from rpg.agents import RPG, Agent, RPGConfig
 from rpg.agents.scripted import SCRIPTED, make_scripted
 from rpg.allocation import keep_freed_memory
 from rpg.compiling import compiler_missing
+from rpg.conf import compose_config
 from rpg.envs.config import EnvConfig
 from rpg.envs.make import make_envs, objects_of_interest
 from rpg.errors import CheckpointError, RPGError, nearest
@@ -25,6 +26,15 @@ from rpg.training.loggers import Loggers, Sink, TensorBoardSink, WandbSink
 from rpg.training.trainer import Trainer
 
 LEARNERS = ("rpg", "mbsac")
+
+
+def env_preset(name: str) -> EnvConfig:
+    """The section ``env`` of the config under ``env=<name>``.
+
+    Raises:
+        RPGError: no such preset, or one that does not fit.
+    """
+    return parse_config(compose_config(f"env={name}", "device=cpu", "run_dir=unused")).env
 
 
 def parse_config(cfg: DictConfig) -> RunConfig:

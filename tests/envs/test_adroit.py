@@ -22,10 +22,10 @@ from gymnasium_robotics.utils.rotations import quat2euler
 from scipy.spatial.transform import Rotation
 
 from rpg.envs.adroit import AdroitDoorEnv, AdroitHammerEnv, AdroitTask, euler_angles
-from rpg.envs.robotics_ids import register_adroit
+from rpg.envs.registration import register_all
 from rpg.errors import NonFiniteError, RPGError
 
-register_adroit()
+register_all()
 
 MOTIONS = json.loads((Path(__file__).parents[1] / "data" / "adroit_motions.json").read_text())
 IDS = ["rpg/AdroitDoor-v0", "rpg/AdroitHammer-v0"]

@@ -14,14 +14,13 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from hydra import compose, initialize_config_module
 
 import rpg.conf
 from rpg.envs.config import EnvConfig
 from rpg.envs.make import make_envs, objects_of_interest
 from rpg.errors import NonFiniteError, RPGError
 from rpg.pixels import FrameShape
-from rpg.training.build import parse_config
+from rpg.training.build import env_preset
 
 PACKAGES = {  # of presets, by how their name begins
     "ant": "mujoco", "cheetah": "mujoco", "mujoco": "mujoco", "adroit": "gymnasium_robotics",
@@ -37,13 +36,6 @@ OWN = {
 
 
 @cache
-def config_of(preset: str) -> EnvConfig:
-    with initialize_config_module("rpg.conf", version_base="1.3"):
-        return parse_config(
-            compose("config", overrides=[f"env={preset}", "device=cpu", "run_dir=unused"])
-        ).env
-
-
 def needs(preset: str) -> None:
     package = next((p for start, p in PACKAGES.items() if preset.startswith(start)), None)
     if package is not None and importlib.util.find_spec(package) is None:
@@ -58,7 +50,7 @@ def preset(request: pytest.FixtureRequest) -> str:
 
 @pytest.fixture
 def envs(preset: str) -> Iterator[Any]:
-    with closing(make_envs(config_of(preset), 2)) as batch:
+    with closing(make_envs(env_preset(preset), 2)) as batch:
         yield batch
 
 
@@ -101,7 +93,7 @@ def test_spaces_types_and_values(preset: str, envs: Any) -> None:
 def test_equal_seeds_give_equal_episodes_to_the_bit(preset: str, envs: Any) -> None:
     first = play(envs, 15, seed=3)
     play(envs, 7, seed=8)  # what came before must not matter
-    with closing(make_envs(config_of(preset), 2)) as other:
+    with closing(make_envs(env_preset(preset), 2)) as other:
         again, fresh = play(envs, 15, seed=3), play(other, 15, seed=3)
     for a, b, c in zip(first, again, fresh, strict=True):
         np.testing.assert_array_equal(a, b)
@@ -119,7 +111,7 @@ def test_objects_of_interest_lie_in_the_observation_and_in_range(preset: str, en
     if FrameShape.of(envs.single_observation_space) is not None:
         pytest.xfail("pictures are looked at whole")
     dim = envs.single_observation_space.shape[0]
-    objects = objects_of_interest(config_of(preset), envs, dim)
+    objects = objects_of_interest(env_preset(preset), envs, dim)
     assert 0 < objects.dim <= dim
     assert all(0 <= i < dim for i in objects.index)
     if preset in OWN or preset.startswith("bandit"):
@@ -142,7 +134,7 @@ LIMITS = {
 @pytest.mark.parametrize("preset", LIMITS)
 def test_the_time_limit_is_a_truncation_and_success_is_told(preset: str) -> None:
     needs(preset)
-    config = config_of(preset)
+    config = env_preset(preset)
     with closing(make_envs(config, 1)) as envs:
         envs.reset(seed=[0])
         still = np.zeros(envs.action_space.shape, np.float32)
@@ -163,7 +155,7 @@ def test_pictures_are_drawn_and_not_blank(preset: str) -> None:
 
         if missing := vulkan_missing():
             pytest.skip(missing)
-    with closing(make_envs(config_of(preset), 1, render=True)) as envs:
+    with closing(make_envs(env_preset(preset), 1, render=True)) as envs:
         envs.reset(seed=[0])
         (frame,) = envs.render()
         assert frame.dtype == np.uint8
@@ -175,7 +167,7 @@ def test_pictures_are_drawn_and_not_blank(preset: str) -> None:
 @pytest.mark.parametrize("preset", [p for p in sorted(LIMITS) if not p.startswith("maze")])
 def test_worker_processes_play_the_same_episodes(preset: str) -> None:
     needs(preset)
-    config = config_of(preset)
+    config = env_preset(preset)
     apart = EnvConfig(**{**vars(config), "asynchronous": True})
     with closing(make_envs(config, 2)) as here, closing(make_envs(apart, 2)) as there:
         for a, b in zip(play(here, 5), play(there, 5), strict=True):
@@ -185,7 +177,7 @@ def test_worker_processes_play_the_same_episodes(preset: str) -> None:
 @pytest.mark.parametrize("preset", [p for p in sorted(LIMITS) if not p.startswith(("maze", "mujoco_"))])
 def test_bad_actions_are_answered_in_one_line(preset: str) -> None:
     needs(preset)
-    config = config_of(preset)
+    config = env_preset(preset)
     with closing(gym.make(config.id, **config.kwargs)) as env:
         env.reset(seed=0)
         shape = env.action_space.shape
@@ -204,7 +196,7 @@ def test_bad_actions_are_answered_in_one_line(preset: str) -> None:
 @pytest.mark.parametrize("preset", [p for p in sorted(LIMITS) if not p.startswith(("maze", "mujoco_"))])
 def test_fifty_resets_do_not_grow(preset: str) -> None:
     needs(preset)
-    with closing(make_envs(config_of(preset), 1)) as envs:
+    with closing(make_envs(env_preset(preset), 1)) as envs:
 
         def resident_kb() -> int:
             gc.collect()

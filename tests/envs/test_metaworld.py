@@ -19,10 +19,10 @@ from metaworld.env_dict import ALL_V3_ENVIRONMENTS
 from metaworld.policies import SawyerBasketballV3Policy, SawyerStickPullV3Policy
 
 from rpg.envs.metaworld import MetaWorldEnv, symlog
-from rpg.envs.robotics_ids import register_metaworld
+from rpg.envs.registration import register_all
 from rpg.errors import NonFiniteError, RPGError
 
-register_metaworld()
+register_all()
 
 PUBLISHED = ["basketball-v3", "stick-pull-v3"]
 POLICIES: dict[str, Any] = {PUBLISHED[0]: SawyerBasketballV3Policy, PUBLISHED[1]: SawyerStickPullV3Policy}

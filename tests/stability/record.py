@@ -41,8 +41,7 @@ def record(
 
 def maze_config(folder: Path, steps: int, *overrides: str) -> DictConfig:
     """The config of a run in the maze as the command line makes it, without evaluations."""
-    from hydra import compose, initialize_config_module
+    from rpg.conf import compose_config
 
     quiet = ["trainer.eval_every=0", "logger=files", f"run_dir={folder}"]
-    with initialize_config_module("rpg.conf", version_base="1.3"):
-        return compose("config", ["env=maze", f"trainer.steps={steps}", *quiet, *overrides])
+    return compose_config("env=maze", f"trainer.steps={steps}", *quiet, *overrides)

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hydra import compose, initialize_config_module
 from omegaconf import DictConfig
 from torch import Tensor
 
+from rpg.conf import compose_config
 from rpg.errors import CheckpointError
 from rpg.train import train
 from rpg.training.build import build_trainer, parse_config
@@ -76,8 +76,7 @@ def checkpoint_differences(a: Path, b: Path) -> list[str]:
 
 
 def complete(folder: Path, overrides: tuple[str, ...]) -> Path:
-    with initialize_config_module("rpg.conf", version_base="1.3"):
-        train(compose("config", [f"run_dir={folder / 'run'}", "device=cpu", "logger=files", *overrides]))
+    train(compose_config(f"run_dir={folder / 'run'}", "device=cpu", "logger=files", *overrides))
     return folder / "run"
 
 

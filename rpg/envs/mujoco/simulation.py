@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from typing import Any
 
-import gymnasium
 import mujoco
 import numpy as np
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
 from rpg.envs.checks import checked_action
-from rpg.envs.mujoco_picture import Frame, MujocoPicture, View
-from rpg.errors import NonFiniteError, RPGError
+from rpg.envs.mujoco_picture import PicturedSimulation
+from rpg.errors import NonFiniteError
 
 Array = NDArray[Any]
 
-_NO_VIEW = View((0.0, 0.0, 0.0), 1.0, 0.0, 0.0)  # a named camera is looked through instead
 
-
-class MujocoTask(gymnasium.Env[Array, Array]):
+class MujocoTask(PicturedSimulation, ABC):
     """A MuJoCo model whose motors take actions in [-1, 1]; a task adds its start, observation and ``step``.
 
     Args:
@@ -48,16 +46,9 @@ class MujocoTask(gymnasium.Env[Array, Array]):
         camera: str,
         render_size: int,
     ) -> None:
-        if render_mode not in (None, "rgb_array"):
-            raise RPGError(f"{name}: render_mode '{render_mode}' is unknown; use 'rgb_array' or None")
-        self.render_mode = render_mode
-        self.model: Any = mujoco.MjModel.from_xml_string(xml)
-        # MuJoCo would put a diverged simulation back to its start and go on; we want to know.
-        self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
-        self.data: Any = mujoco.MjData(self.model)
-        self._picture = MujocoPicture(name, self.model, self.data, camera, _NO_VIEW, render_size)
-
-        self._name, self._frame_skip = name, frame_skip
+        model: Any = mujoco.MjModel.from_xml_string(xml)
+        super().__init__(name, model, mujoco.MjData(model), render_mode, camera, render_size)
+        self._frame_skip = frame_skip
         # Views of the simulator's own arrays: they stay valid as long as the data does.
         self._qpos, self._qvel, self._ctrl = self.data.qpos, self.data.qvel, self.data.ctrl
         self._action_dim = int(self.model.nu)
@@ -81,13 +72,13 @@ class MujocoTask(gymnasium.Env[Array, Array]):
         mujoco.mj_forward(self.model, self.data)
         return self._observe(), {}
 
+    @abstractmethod
     def _place(self, options: dict[str, Any]) -> None:
         """Move everything from the model's initial state to a start of the task's."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _observe(self) -> Array:
         """The observation, (obs_dim,) float32."""
-        raise NotImplementedError
 
     def _simulate(self, action: Array) -> None:
         """One action's time of simulation.
@@ -112,20 +103,3 @@ class MujocoTask(gymnasium.Env[Array, Array]):
                 f"(torso or root at {self._qpos[:3].tolist()}); reset it to go on"
             )
         return self._buffer.astype(np.float32)
-
-    def render(self) -> Frame | None:
-        """A uint8 (render_size, render_size, 3) RGB picture, or None without a render mode.
-
-        Raises:
-            RPGError: there is no OpenGL to draw with.
-        """
-        if self.render_mode is None:
-            return None
-        # Where things and cameras are now; a full forward pass would change what the solver starts its next step from.
-        for bring_up_to_date in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_camlight):
-            bring_up_to_date(self.model, self.data)
-        return self._picture.draw()
-
-    def close(self) -> None:
-        """Free the renderer, if one was opened."""
-        self._picture.close()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from typing import Any
 
 import gymnasium
@@ -11,7 +12,7 @@ from gymnasium.spaces import Box
 from numpy.typing import NDArray
 from sapien import physx
 
-from rpg.envs.checks import checked_action
+from rpg.envs.checks import checked_action, checked_render_mode
 from rpg.envs.sapien.block_picture import BlockPainter, Frame
 from rpg.envs.sapien.physics import physics_scene, physx_settings
 from rpg.errors import RPGError
@@ -124,7 +125,7 @@ class BlockPhysics:
         return builder.build(fix_root_link=True)
 
 
-class _BlockPush(gymnasium.Env[NDArray[Any], Floats]):
+class _BlockPush(gymnasium.Env[NDArray[Any], Floats], ABC):
     """What the state and the picture version share; ``_observe`` is theirs."""
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 12}  # noqa: RUF012
@@ -134,11 +135,9 @@ class _BlockPush(gymnasium.Env[NDArray[Any], Floats]):
     def __init__(self, blocks: int, render_mode: str | None, picture_size: int) -> None:
         if not 1 <= blocks <= MAX_BLOCKS:
             raise RPGError(f"{self.name}: blocks={blocks} must be between 1 and {MAX_BLOCKS}")
-        if render_mode not in (None, "rgb_array"):
-            raise RPGError(f"{self.name}: render_mode '{render_mode}' is unknown; use 'rgb_array' or None")
         if picture_size < 16:
             raise RPGError(f"{self.name}: picture_size={picture_size} must be at least 16")
-        self.render_mode = render_mode
+        self.render_mode = checked_render_mode(self.name, render_mode)
         self.picture_size = picture_size
         self.action_space = Box(-1.0, 1.0, (2,), np.float32)
         self.physics = BlockPhysics(blocks)
@@ -209,8 +208,9 @@ class _BlockPush(gymnasium.Env[NDArray[Any], Floats]):
             )
         return self._painter.frame(self.physics.position)
 
+    @abstractmethod
     def _observe(self) -> NDArray[Any]:
-        raise NotImplementedError
+        """What the agent sees of the present state."""
 
 
 class BlockPushEnv(_BlockPush):

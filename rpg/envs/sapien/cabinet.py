@@ -14,7 +14,7 @@ import sapien
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
-from rpg.envs.checks import checked_action
+from rpg.envs.checks import checked_action, checked_render_mode
 from rpg.envs.sapien import cabinet_model as model
 from rpg.envs.sapien.cabinet_task import (
     CabinetStart,
@@ -252,12 +252,10 @@ class CabinetEnv(gymnasium.Env[Floats, Floats]):
     ) -> None:
         task = checked_variant(variant)
         self.name = f"cabinet ({variant})"
-        if render_mode not in (None, "rgb_array"):
-            raise RPGError(f"{self.name}: render_mode '{render_mode}' is unknown; use 'rgb_array' or None")
         if sim_freq < model.CONTROL_FREQ or sim_freq % model.CONTROL_FREQ:
             raise RPGError(f"{self.name}: sim_freq={sim_freq} must be a multiple of {model.CONTROL_FREQ}")
         self.variant = variant
-        self.render_mode = render_mode
+        self.render_mode = checked_render_mode(self.name, render_mode)
         self.physics = CabinetPhysics(task.mobile, sim_freq)
         self._ignored = BASE if published_actions and not task.mobile else 0
         self._action_size = (BASE if task.mobile else 0) + ARM + 1 + self._ignored

@@ -18,6 +18,7 @@ from mani_skill.utils.registration import REGISTERED_ENVS
 from numpy.typing import NDArray
 
 import rpg.envs.sapien.cabinet_maniskill  # noqa: F401 (registers the cabinet tasks)
+from rpg.envs.checks import checked_render_mode
 from rpg.envs.sapien.physics import VULKAN_REMEDY
 from rpg.errors import NonFiniteError, RPGError, nearest
 
@@ -225,8 +226,7 @@ class ManiSkillBatch(VectorEnv[Array, Array, Array]):
             raise RPGError(f"ManiSkill: task '{task}' is unknown; {nearest(task, REGISTERED_ENVS)}")
         if obs_mode not in (STATE, RGB):
             raise RPGError(f"{task}: obs_mode '{obs_mode}' is not supported; use '{STATE}' or '{RGB}'")
-        if render_mode not in (None, "rgb_array"):
-            raise RPGError(f"{task}: render_mode '{render_mode}' is unknown; use 'rgb_array' or None")
+        checked_render_mode(task, render_mode)
         if num_envs < 1 or (max_episode_steps is not None and max_episode_steps < 1):
             raise RPGError(
                 f"{task}: num_envs={num_envs} and max_episode_steps={max_episode_steps} must be at least 1"
