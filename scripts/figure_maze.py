@@ -3,7 +3,7 @@
     python scripts/figure_maze.py gather     # from the checkpoints in runs/coverage to results/maze/*.csv
     python scripts/figure_maze.py draw       # from results/maze/*.csv to results/maze/figure_3_5.png
 
-`gather` wants finished runs of `scripts/coverage.py`; `draw` needs only what the repository holds.
+`gather` wants finished runs of `scripts/maze_coverage.py`; `draw` needs only what the repository holds.
 """
 
 from __future__ import annotations
@@ -135,7 +135,9 @@ def _coverage(ax, published: bool) -> None:  # type: ignore[no-untyped-def]
 
 def _read(path: Path) -> list[dict[str, str]]:
     if not path.exists():
-        raise RPGError(f"{path}: missing; run scripts/coverage.py and then scripts/figure_maze.py gather")
+        raise RPGError(
+            f"{path}: missing; run scripts/maze_coverage.py and then scripts/figure_maze.py gather"
+        )
     with path.open() as file:
         return list(csv.DictReader(line for line in file if not line.startswith("#")))
 

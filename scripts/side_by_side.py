@@ -26,7 +26,7 @@ class Job:
         """The `rpg-train` command: files alone, no evaluations."""
         return [
             sys.executable, "-m", "rpg.train", *self.overrides, f"threads={self.threads}", "logger=files",
-            "trainer.eval_every=0", f"run_dir={self.folder}",
+            "trainer.eval_every=0", f"run_dir='{self.folder}'",
         ]  # fmt: skip
 
 

@@ -3,8 +3,8 @@
     python scripts/time_to_coverage.py                # seeds 0 to 4, one after the other, two threads each
     python scripts/time_to_coverage.py --seeds 0 --goal 0.8
 
-Each run is the `rpg` variant of `scripts/coverage.py`, stopped (and saved) at the goal, so that `coverage.py run rpg`
-carries it on to its full length. Run this on an idle machine. A line is added to
+Each run is the `rpg` variant of `scripts/maze_coverage.py`, stopped (and saved) at the goal, so that
+`maze_coverage.py run rpg` carries it on to its full length. Run this on an idle machine. A line is added to
 `results/maze/time_to_coverage.csv` after every seed; a run that was started before is refused, because its clock
 includes the pause. `wall_s` contains `compile_s`, the seconds that compiling or loading compiled code took.
 """
@@ -20,7 +20,7 @@ import sys
 import time
 from pathlib import Path
 
-from coverage import job
+from maze_coverage import job
 from side_by_side import write_table
 
 from rpg.provenance import commit, cpu_name

@@ -160,6 +160,6 @@ def test_every_setting_is_in_its_table(page: str, schema: type) -> None:
 
 def test_every_variant_of_the_maze_experiment_is_described(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(ROOT / "scripts"))  # as when it is run
-    variants = runpy.run_path(str(ROOT / "scripts" / "coverage.py"))["VARIANTS"]
+    variants = runpy.run_path(str(ROOT / "scripts" / "maze_coverage.py"))["VARIANTS"]
     page = text("docs/maze.md")
     assert [name for name in variants if f"`{name}`" not in page and name not in ("rpg", "mbsac")] == []

@@ -46,7 +46,7 @@ def test_coverage_runs_are_gathered_with_their_origin(tmp_path: Path) -> None:
         tmp_path, "-m", "rpg.train", "agent=random", "env=maze", "logger=files", "trainer.steps=1000",
         "trainer.log_every=500", "trainer.eval_every=0", f"run_dir={folder}",
     )  # fmt: skip
-    run(tmp_path, str(ROOT / "scripts" / "coverage.py"), "gather")
+    run(tmp_path, str(ROOT / "scripts" / "maze_coverage.py"), "gather")
     with (tmp_path / "results" / "maze" / "coverage.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [row["env_steps"] for row in rows] == ["500", "1000"]

@@ -1,8 +1,8 @@
 """Run or resume the maze experiments and gather their curves.
 
-    python scripts/coverage.py list                       # what there is
-    python scripts/coverage.py run rpg mbsac --jobs 2     # run these variants, resuming what was interrupted
-    python scripts/coverage.py gather                     # runs/coverage -> results/maze/coverage.csv
+    python scripts/maze_coverage.py list                       # what there is
+    python scripts/maze_coverage.py run rpg mbsac --jobs 2     # run these variants, resuming what was interrupted
+    python scripts/maze_coverage.py gather                     # runs/coverage -> results/maze/coverage.csv
 
 Every run is an ordinary `rpg-train` command, one thread each; `gather` reads its progress.csv and run.json.
 Coverage is the share of the maze's 100 unit cells ever visited during training.
