@@ -11,7 +11,7 @@ $(VENV)/.core: pyproject.toml constraints.txt scripts/install.sh
 	@touch $@
 
 $(VENV)/.dev: $(VENV)/.core
-	PYTHON="$(PYTHON)" sh scripts/install.sh "$(VENV)" ".[dev,wandb,joblib,slurm,mujoco,metaworld,maniskill]"
+	PYTHON="$(PYTHON)" sh scripts/install.sh "$(VENV)" ".[dev,wandb,joblib,slurm,mujoco,metaworld,maniskill,plasticine]"
 	@touch $@
 
 $(VENV)/.docs: $(VENV)/.core

@@ -46,7 +46,16 @@ def commit() -> str:
     return f"{head}-dirty" if changed else head
 
 
-_SIMULATORS = ("gymnasium", "mujoco", "gymnasium-robotics", "metaworld", "sapien", "mani-skill")
+_SIMULATORS = (
+    "gymnasium",
+    "mujoco",
+    "gymnasium-robotics",
+    "metaworld",
+    "sapien",
+    "mani-skill",
+    "numba",
+    "taichi",
+)
 
 
 def simulator_versions() -> dict[str, str]:

@@ -6,6 +6,7 @@ import gymnasium
 
 from rpg.envs.bandit import register_bandit
 from rpg.envs.mujoco.registration import register_mujoco
+from rpg.envs.plasticine_registration import register_plasticine
 from rpg.envs.sapien.registration import register_sapien
 
 _ROBOTICS = {
@@ -30,6 +31,7 @@ def register_all() -> None:
     """Register every environment with gymnasium; safe to call again. Nothing heavy is imported."""
     register_bandit()
     register_mujoco()
+    register_plasticine()
     register_sapien()
     for env_id, (entry_point, horizon) in _ROBOTICS.items():
         if env_id not in gymnasium.registry:

@@ -25,7 +25,7 @@ from rpg.training.build import env_preset
 PACKAGES = {  # of presets, by how their name begins
     "ant": "mujoco", "cheetah": "mujoco", "mujoco": "mujoco", "adroit": "gymnasium_robotics",
     "gymnasium_robotics": "gymnasium_robotics", "metaworld": "metaworld", "block": "sapien", "visual": "sapien",
-    "cabinet": "mani_skill", "maniskill": "mani_skill",
+    "cabinet": "mani_skill", "maniskill": "mani_skill", "plasticine": "numba",
 }  # fmt: skip
 PRESETS = sorted(path.stem for path in (Path(rpg.conf.__file__).parent / "env").glob("*.yaml"))
 OWN = {

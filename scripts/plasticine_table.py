@@ -1,0 +1,134 @@
+"""Table 2.1: scores of gradient-based trajectory optimisation on the ten plasticine tasks.
+
+    python scripts/plasticine_table.py run move torus --method adam --variants 1 2 --seeds 0 --jobs 2
+    python scripts/plasticine_table.py run                  # all tasks, variant 1, seed 0, Adam; resumes
+    python scripts/plasticine_table.py gather               # runs/solve -> results/plasticine/table_2_1.csv, curves.csv
+    python scripts/plasticine_table.py draw                 # results/plasticine/curves.csv -> figure_2_4.png
+
+Every run is an ordinary `rpg-solve` command, one thread each unless `--threads` says otherwise, that resumes where it
+was interrupted. `gather` keeps rows of runs whose folders are gone. Scores are under hard contact.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import statistics
+import sys
+from collections import defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+
+import figure_2_4
+from growing_table import Table
+from side_by_side import Job, run_side_by_side
+
+from rpg.errors import RPGError, nearest
+from rpg.plasticine.scenes import scene_names
+from rpg.plasticine.solver import METHODS
+
+RUNS, OUT = Path("runs/solve"), Path("results/plasticine")
+_KEY = ["task", "variant", "method", "seed"]
+_COLUMNS = [*_KEY, "score", "episodes", "wall_s", "loss", "targets", "commit"]
+_CURVES = [*_KEY, "episode", "loss", "score"]
+_PUBLISHED = Path("results/published/plasticine_table_2_1.csv")
+
+
+@dataclass(frozen=True)
+class SolveJob(Job):
+    """One optimisation."""
+
+    @property
+    def command(self) -> list[str]:
+        """The `rpg-solve` command."""
+        return [
+            sys.executable, "-m", "rpg.solve", *self.overrides, f"threads={self.threads}", f"run_dir={self.folder}",
+        ]  # fmt: skip
+
+
+def jobs_of(args: argparse.Namespace) -> list[Job]:
+    """One run for each variant, task and seed, all tasks of a variant first.
+
+    Raises:
+        RPGError: an unknown task.
+    """
+    if unknown := set(args.tasks) - set(scene_names()):
+        raise RPGError(f"task {min(unknown)!r} is unknown; {nearest(min(unknown), scene_names())}")
+    jobs: list[Job] = []
+    for seed in args.seeds:
+        for variant in args.variants:
+            for task in args.tasks or scene_names():
+                overrides = [f"task={task}", f"variant={variant}", f"optimizer={args.method}", f"seed={seed}"]
+                if args.iterations:
+                    overrides.append(f"iterations={args.iterations}")
+                folder = RUNS / f"{task}-v{variant}" / args.method / f"seed{seed}"
+                name = f"{task}-v{variant} {args.method} seed {seed}"
+                jobs.append(SolveJob(name, folder, tuple(overrides), args.threads))
+    return jobs
+
+
+def gather() -> Path:
+    """Write a row for every finished run and a line for every iteration of it.
+
+    Raises:
+        RPGError: there is no finished run and no table.
+    """
+    table = Table(OUT / "table_2_1.csv", _COLUMNS, _KEY)
+    curves = Table(OUT / "curves.csv", _CURVES, [*_KEY, "episode"])
+    rows, lines = [], []
+    for path in sorted(RUNS.glob("*/*/seed*/result.json")):
+        origin = json.loads((path.parent / "run.json").read_text())
+        rows.append(json.loads(path.read_text()) | {"commit": origin["commit"]})
+        with (path.parent / "curves.csv").open(newline="") as file:
+            lines += list(csv.DictReader(file))
+    table.extend(rows)
+    curves.extend(lines)
+    if not table.rows:
+        raise RPGError(f"{RUNS}: no finished run; start some with 'run'")
+    _tell(table.rows)
+    return table.path
+
+
+def _tell(rows: list[dict[str, str]]) -> None:
+    """Means and deviations of tasks beside the published ones."""
+    scores: dict[tuple[str, str], list[float]] = defaultdict(list)
+    for row in rows:
+        scores[row["method"], row["task"]].append(float(row["score"]))
+    published = {}
+    if _PUBLISHED.exists():
+        with _PUBLISHED.open(newline="") as file:
+            published = {(row["method"], row["task"]): row for row in csv.DictReader(file)}
+    for (method, task), values in sorted(scores.items()):
+        other = published.get((method, task))
+        beside = f", published {other['mean']} +- {other['std']}" if other else ""
+        spread = statistics.pstdev(values)
+        print(
+            f"{method:10} {task:12} {statistics.fmean(values):.2f} +- {spread:.2f} of {len(values)} runs{beside}"
+        )
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Console entry."""
+    parser = argparse.ArgumentParser(description="Table 2.1.")
+    parser.add_argument("action", choices=["run", "gather", "draw"])
+    parser.add_argument("tasks", nargs="*", help="of 'run'; default: all")
+    parser.add_argument("--method", default="adam", choices=METHODS)
+    parser.add_argument("--variants", type=int, nargs="+", default=[1])
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
+    parser.add_argument("--iterations", type=int, help="default: that of the config")
+    parser.add_argument("--jobs", type=int, default=1, help="runs side by side")
+    parser.add_argument("--threads", type=int, default=1)
+    args = parser.parse_args(argv)
+    try:
+        if args.action == "run":
+            return run_side_by_side(jobs_of(args), args.jobs)
+        print(gather() if args.action == "gather" else figure_2_4.draw())
+    except RPGError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
