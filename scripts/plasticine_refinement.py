@@ -11,6 +11,9 @@ Two small scenes without walls and gravity, the same particles at every resoluti
 Three series for each: grid and time step together (at one Courant number), grid alone, time step alone. The error is
 the root mean square of the particles' distance to where the finest run of the series has them, in units of how far
 they went there. Float32 is measured against float64 in the same setting.
+
+With the grid held, smaller time steps converge slowly: particles and grid exchange velocities at every substep, and
+each exchange smooths them a little.
 """
 
 from __future__ import annotations
@@ -22,7 +25,6 @@ import time
 from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 from growing_table import Table
@@ -38,13 +40,11 @@ from rpg.provenance import commit
 _OUT = Path("results/plasticine/refinement.csv")
 _KEY = ["case", "series", "grid", "substeps", "dtype"]
 _COLUMNS = [*_KEY, "dt", "particles", "error", "worst", "wall_s", "threads", "commit"]
-_STEP_S, _STEPS = 1.9e-3, 5  # an environment step, as in the published tasks, and how many
-_PARTICLES = 24_000  # eight to a cell of the finest grid
+_STEP_S = 1.9e-3  # an environment step, as in the published tasks
+_PARTICLES = 60_000  # 25 to a cell of the finest grid: their random places must not be what is measured
 
-CASES: dict[str, dict[str, Any]] = {
-    "vibration": {"yield_stress": 1e6},
-    "press": {"yield_stress": 50.0},
-}
+# Environment steps and yield stress.
+CASES: dict[str, tuple[int, float]] = {"vibration": (2, 1e6), "press": (5, 50.0)}
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Setting:
 
 
 # The last one of each series is the finest, which the others are measured against.
-_GRIDS = (16, 24, 32, 48, 64, 96)
+_GRIDS = (16, 20, 24, 32, 40, 64)
 SERIES = {
     "grid and time step": [Setting(n, round(n / 3.2)) for n in _GRIDS],
     "grid": [Setting(n, 40) for n in _GRIDS],
@@ -77,7 +77,7 @@ def scene_of(case: str, setting: Setting, dtype: str) -> Scene:
         "name": case, "gravity": [0.0, 0.0, 0.0], "tools": tools if case == "press" else [],
         "bodies": [{"shape": "ball", "size": [0.13], "centre": [0.5, 0.5, 0.5], "particles": _PARTICLES}],
         "grid": setting.grid, "substeps": setting.substeps, "dt": _STEP_S / setting.substeps,
-        "dtype": dtype, "sweeps": 6 if dtype == "float64" else 3, **CASES[case],
+        "dtype": dtype, "sweeps": 6 if dtype == "float64" else 3, "yield_stress": CASES[case][1],
     }  # fmt: skip
     return load_scene(given)
 
@@ -101,7 +101,7 @@ def simulate(case: str, setting: Setting, dtype: str) -> tuple[Tensor, Tensor, f
     closing = torch.tensor([1.0, 0.3, 0.0, -1.0, 0.0, 0.3][: scene.action_dim], dtype=torch.float64)
     begin = time.perf_counter()
     with torch.no_grad():
-        for _ in range(_STEPS):
+        for _ in range(CASES[case][0]):
             state = scene.step(state, closing)
     return start.particles.x[0].double(), state.particles.x[0].double(), time.perf_counter() - begin
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
-from dough import moving, repeated, run, scene, sphere, strained
+from dough import CELL, STICKY, idle, moving, repeated, run, scene, sphere, strained
 from torch import Tensor
 
 from rpg.plasticine.scene import Scene
@@ -46,7 +47,11 @@ def pressed(yield_stress: float, substeps: int) -> tuple[Scene, State]:
 
     def made(substeps: int) -> Scene:
         tool = sphere(0.5, 0.605, 0.5, radius=0.06, scale=0.01 * substeps / 19)
-        given = {"substeps": substeps, "yield_stress": yield_stress, "gravity": [3.0, -30.0, 0.0]}
+        given: dict[str, Any] = {
+            "substeps": substeps,
+            "yield_stress": yield_stress,
+            "gravity": [3.0, -30.0, 0.0],
+        }
         return scene(tool, particles=80, size=(0.12,) * 3, **given)
 
     warm = made(19)
@@ -89,6 +94,63 @@ def test_against_differences(wrt: str, yield_stress: float, substeps: int) -> No
         assert at.grad.abs().max() == 0
     else:
         assert relative_error(function, size) < CLOSE
+
+
+def velocities(scene: Scene, state: State, action: Tensor) -> Function:
+    """The objective after a step, with all velocities moved by the argument."""
+
+    def after(d: Tensor) -> Tensor:
+        return objective(scene.step(moving(state, state.particles.v + d.view_as(state.particles.v)), action))
+
+    return after
+
+
+TURNED = [0.9, 0.1, 0.1, 0.05]
+TOOLS: dict[str, dict[str, Any]] = {
+    "pin": {"shape": "capsule", "size": [0.2, 0.05], "motion": "roll", "rotation": [0.707, 0.707, 0.0, 0.0]},
+    "capsule": {"shape": "capsule", "size": [0.2, 0.05], "motion": "pose", "rotation": [0.6, 0.5, 0.2, 0.1]},
+    "box": {"shape": "box", "size": [0.06, 0.05, 0.07], "motion": "pose", "rotation": TURNED},
+    "cylinder": {"shape": "cylinder", "size": [0.06, 0.05], "motion": "pose", "rotation": TURNED},
+    "torus": {"shape": "torus", "size": [0.06, 0.04], "motion": "pose", "rotation": TURNED},
+    "chopsticks": {
+        "shape": "chopsticks", "size": [0.2, 0.03], "motion": "chopsticks", "rotation": TURNED, "gap": 0.08,
+        "min_gap": 0.05,
+    },
+}  # fmt: skip
+SCALES = {
+    "roll": [0.6, 0.06, 0.01],
+    "pose": [0.01] * 3 + [0.1] * 3,
+    "chopsticks": [0.01] * 3 + [0.1] * 3 + [0.02],
+}
+
+
+@pytest.mark.parametrize("name", TOOLS)
+def test_every_tool_and_motion_against_differences(name: str) -> None:
+    tool = TOOLS[name]
+    height = 0.68 if name == "chopsticks" else 0.6
+    made = scene(
+        tool | {"position": [0.5, height, 0.5], "scale": SCALES[tool["motion"]]},
+        particles=80,
+        size=(0.12,) * 3,
+        sweeps=6,
+    )
+    noise = torch.randn(80, 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    start = moving(made.initial_state(), torch.tensor([0.2, 2.0, -0.1]) + 0.5 * noise)
+    state = run(made, torch.full((1, made.action_dim), -0.3, dtype=torch.float64), start)[-1]
+    action = torch.linspace(-0.7, 0.8, made.action_dim).double()
+    assert relative_error(lambda d: objective(made.step(state, action + d)), made.action_dim) < CLOSE
+    assert relative_error(velocities(made, state, action), 3 * made.n_particles) < CLOSE
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.5, 1.5, STICKY])
+def test_every_floor_against_differences(friction: float) -> None:
+    made = scene(
+        particles=80, size=(0.12,) * 3, centre=(0.5, 2 * CELL + 0.05, 0.5), floor_friction=friction, sweeps=6
+    )
+    noise = torch.randn(80, 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    state = idle(made, 1, moving(made.initial_state(), torch.tensor([1.0, -2.0, 0.5]) + 0.5 * noise))[-1]
+    none = torch.zeros(0, dtype=torch.float64)
+    assert relative_error(velocities(made, state, none), 3 * made.n_particles) < CLOSE
 
 
 _TURN = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64))[0]

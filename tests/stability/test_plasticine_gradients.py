@@ -50,7 +50,8 @@ def pushing_solver(tmp_path: Path, **settings: Any) -> Solver:
         sphere(0.4, 0.5, 0.5), size=(0.12,) * 3, centre=(0.5, 0.5, 0.5), particles=100, gravity=[0.0] * 3,
         target=target,
     )  # fmt: skip
-    return Solver(made, SolverConfig(**({"horizon": 3, "lr": 0.01, "optimizer": "gd"} | settings)))
+    given: dict[str, Any] = {"horizon": 3, "lr": 0.01, "optimizer": "gd"}
+    return Solver(made, SolverConfig(**given | settings))
 
 
 def times(solver: Solver, factor: float) -> RemovableHandle:
@@ -131,11 +132,14 @@ def spoilt(state: State, place: str, value: float) -> State:
 
 
 @pytest.mark.parametrize("near", [True, False], ids=["in contact", "far away"])
-@pytest.mark.parametrize("value", [torch.nan, torch.inf])
-@pytest.mark.parametrize("place", ["x", "v", "C", "b", "E", "yield", "pose"])
+@pytest.mark.parametrize(
+    ("place", "value"),
+    [
+        *((place, value) for place in ("x", "v", "C", "b", "E", "pose") for value in (torch.nan, torch.inf)),
+        ("yield", torch.nan),  # an infinite one is an elastic body
+    ],
+)
 def test_a_state_that_is_not_finite_is_an_error(place: str, value: float, near: bool) -> None:
-    if (place, value) == ("yield", torch.inf):
-        pytest.skip("an infinite yield stress is an elastic body")
     block = scene(sphere(0.5, 0.6 if near else 0.9, 0.5), size=(0.12,) * 3, particles=100)
     state = spoilt(block.initial_state(), place, value)
     with pytest.raises(NonFiniteError, match="dough-v1: environment step 1"):

@@ -46,7 +46,12 @@ def kernel(function: F) -> F:
     Numba looks at the file of an entry point alone to see whether what it kept is out of date; here every source of
     kernels counts.
     """
-    dispatcher = numba.njit(**_COMMON, nogil=True, cache=True)(function)
+    dispatcher = numba.njit(**_COMMON, nogil=True)(function)
+    try:
+        dispatcher.enable_caching()
+    except RuntimeError:
+        # No folder can be written to: every process compiles for itself.
+        return dispatcher
     dispatcher._cache._cache_file._source_stamp = _STAMP
     return dispatcher
 

@@ -142,6 +142,8 @@ def update_nodes(
             if record:
                 store(space.momentum, 4 * (base + node), q)
             mass = quad_last(q)
+            # Weights of a position that is not finite: its particle's velocity will not be either.
+            bad += 0.0 * mass
             v = select(mass > LEAST_MASS, with_last(q / mass + fall, one), zero)
             store(space.velocity, 4 * (base + node), v)
         if is_visited(settings, space, thread, row):
