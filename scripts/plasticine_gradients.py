@@ -39,7 +39,7 @@ from rpg.provenance import commit
 _OUT = Path("results/plasticine/gradients.csv")
 _KEY = ["check", "task", "variant", "particles", "wrt", "steps", "direction"]
 _COLUMNS = [*_KEY, "autodiff", "difference", "h", "error", "norm", "cosine", "commit"]
-_SIZES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7)
+_SIZES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8)
 _HORIZONS = (1, 2, 5, 10, 20, 30, 40, 50)
 _WARM = 32  # environment steps until even the slowest tools are in contact
 _WRT = ("actions", "positions", "E", "yield_stress")
@@ -112,7 +112,7 @@ def check_short(task: str, args: argparse.Namespace, table: Table) -> None:
 
         def value(d: dict[str, Tensor], actor: Scene = actor, share: float = share) -> Tensor:
             state, action = moved(actor, warm, actions[-1], d)
-            return (mixture * actor.step(state, action * share).particles.x).sum()  # noqa: B023 - used at once
+            return (mixture * (actor.step(state, action * share).particles.x - warm.particles.x)).sum()  # noqa: B023 - used at once
 
         offsets = {
             wrt: torch.zeros(shape, dtype=torch.float64, requires_grad=True) for wrt, shape in shapes.items()

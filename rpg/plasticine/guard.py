@@ -69,7 +69,7 @@ def diagnose(scene: Scene, before: State, motion: Tensor, softness: float, after
     physics = scene.physics
     with torch.no_grad():
         bad = _bad_particles(after.particles)
-        entered = not is_finite(*before.particles, before.material)
+        entered = not is_finite(*before.particles, before.material, before.poses.to(before.material))
         substep = None if entered else _first_bad_substep(scene, before, motion, softness)
         speed = sound_speed(before.material, scene.density)
         tool = float(motion[..., 12:15].norm(dim=-1).amax()) if motion.numel() else 0.0

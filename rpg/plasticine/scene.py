@@ -75,6 +75,8 @@ class Scene:
 
     def __init__(self, config: SceneConfig, variant: int = 1) -> None:
         self.config, self.variant = config, variant
+        if config.device == "cuda" and not torch.cuda.is_available():
+            raise RPGError(f"{config.name}: device='cuda': no usable GPU here; choose cpu")
         self.name = f"{config.name}-v{variant}"
         self.physics = Physics(
             grid=config.grid,
@@ -174,6 +176,9 @@ class Scene:
             motion = motion.expand(state.batch, *motion.shape[1:])
         softness = self.softness if softness is None else softness
         moving = motion.to(self.dtype).contiguous()
+        # A position or pose that is infinite would be clamped, and nothing yields beyond a limit that is NaN.
+        if not guard.is_finite(*state.particles, state.material, state.poses.to(self.dtype)):
+            raise guard.diagnose(self, state, moving, softness, state._replace(time=state.time + 1))
         particles = advance(self.backend, state.particles, state.material, moving, softness)
         result = State(particles, poses, state.material, state.time + 1)
         if not guard.is_finite(*particles, moving):

@@ -94,7 +94,7 @@ class Solver:
         self._optimizer: torch.optim.Optimizer
         if config.optimizer == "gd":
             self._optimizer = torch.optim.SGD(
-                [self.actions], config.lr, momentum=_MOMENTUM, dampening=1 - _MOMENTUM
+                [self.actions], config.lr, momentum=_MOMENTUM, dampening=_MOMENTUM
             )
         else:
             self._optimizer = torch.optim.Adam([self.actions], config.lr)
@@ -126,6 +126,8 @@ class Solver:
             self.best_actions = self.actions.detach()[best].cpu().clone()
         norms = self.actions.grad.flatten(1).norm(dim=1)
         clipped, skipped = self._tame(self.actions.grad, norms)
+        kept = [start for start in range(config.starts) if not norms[start].isfinite()]
+        before = self.actions.detach()[kept].clone()
         self._skipped_in_a_row = self._skipped_in_a_row + 1 if skipped == config.starts else 0
         if self._skipped_in_a_row == _MOST_SKIPPED:
             raise NonFiniteError(
@@ -134,6 +136,7 @@ class Solver:
             )
         self._optimizer.step()
         with torch.no_grad():
+            self.actions[kept] = before  # momentum would move them
             self.actions.clamp_(-1.0, 1.0)
         self.iterations += 1
         score = float(rollout.score.detach()[best])

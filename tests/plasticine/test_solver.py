@@ -42,7 +42,7 @@ def run(scene: Scene, iterations: int, **settings: Any) -> tuple[Solver, list[An
 
 @pytest.mark.parametrize("optimizer", METHODS)
 def test_every_method_lowers_the_loss(scene: Scene, optimizer: str) -> None:
-    solver, seen = run(scene, 6, optimizer=optimizer, lr=0.3 if optimizer == "gd" else 0.1)
+    solver, seen = run(scene, 6, optimizer=optimizer, lr=3.0 if optimizer == "gd" else 0.1)
     losses = [row.loss for row in seen]
     assert min(losses) < losses[0] - 1e-3
     assert solver.best_loss == min(losses)
