@@ -44,24 +44,23 @@ def start(device: str) -> None:
     Raises:
         RPGError: unknown or missing device, or another one was started before in this process.
     """
-    if device not in ("cpu", "cuda", "cuda:0"):
+    if device not in ("cpu", "cuda"):
         raise RPGError(
             f"device={device!r} is unknown to the plasticine backend taichi; use cpu or cuda "
             "(CUDA_VISIBLE_DEVICES says which)"
         )
-    kind = device.partition(":")[0]
     if _started:
-        if _started[0] != kind:
+        if _started[0] != device:
             raise RPGError(
                 f"taichi runs on {_started[0]} in this process; start another process for device={device!r}"
             )
         return
-    if kind == "cuda" and not torch.cuda.is_available():
+    if device == "cuda" and not torch.cuda.is_available():
         raise RPGError(f"device={device!r}: torch sees no CUDA device; use device=cpu")
     with contextlib.redirect_stdout(io.StringIO()):  # ti.init announces itself with print
         try:
             ti.init(
-                arch=ti.cuda if kind == "cuda" else ti.cpu,
+                arch=ti.cuda if device == "cuda" else ti.cpu,
                 enable_fallback=False,
                 log_level=ti.WARN,
                 cpu_max_num_threads=torch.get_num_threads(),
@@ -70,4 +69,4 @@ def start(device: str) -> None:
             )
         except RuntimeError as error:
             raise RPGError(f"taichi cannot start on device={device!r}: {error}; use device=cpu") from error
-    _started.append(kind)
+    _started.append(device)
