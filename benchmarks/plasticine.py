@@ -8,7 +8,8 @@
 
 ``forward_ms`` simulates alone, under hard contact; ``forward_backward_ms`` is a rollout under soft contact with the
 loss of every step and the gradient of their sum for all actions. Actions are random and change at every step. Both
-are medians over whole rollouts, divided by their steps. Memory is that of the process after a gradient over an episode.
+are medians over whole rollouts, divided by their steps. ``peak_rss_mb`` is the most memory that the process had,
+``imported_rss_mb`` that with nothing but its libraries.
 """
 
 from __future__ import annotations
@@ -27,12 +28,10 @@ from typing import Any
 
 import torch
 from bench import OUTPUT, Line, apart, append, recorded, short
-from matplotlib.ticker import NullLocator
 
 from rpg.cli import report_errors
 from rpg.envs.plasticine_registration import TASKS
 from rpg.errors import RPGError
-from rpg.figures import curve, new_figure, save, short_count, style_axes
 from rpg.plasticine.scene import Scene, load_scene
 from rpg.provenance import commit, cpu_name
 
@@ -47,6 +46,11 @@ GROWTH: dict[str, tuple[str, list[int], str]] = {
     "batch": ("scenes in a call", [1, 2, 4, 8, 16, 32, 64], "--batch {}"),
     "steps": ("environment steps of an episode", [10, 25, 50, 100, 200], "--steps {}"),
 }
+
+
+def peak_rss_mb() -> float:
+    """Most memory that this process has had."""
+    return short(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
 
 
 def rollout_seconds(scene: Scene, actions: torch.Tensor, gradient: bool) -> float:
@@ -66,6 +70,7 @@ def rollout_seconds(scene: Scene, actions: torch.Tensor, gradient: bool) -> floa
 def measure(args: argparse.Namespace, task: str) -> Line:
     """One scene, in this process."""
     torch.set_num_threads(args.threads)
+    imported = peak_rss_mb()
     begin = time.perf_counter()
     scene = load_scene(task, variant=args.variant, preset=args.preset, settings=settings(args.set))
     generator = torch.Generator().manual_seed(0)
@@ -86,7 +91,8 @@ def measure(args: argparse.Namespace, task: str) -> Line:
         "forward_ms": short(forward),
         "forward_backward_ms": short(both),
         "first_gradient_s": short(ready),
-        "peak_rss_mb": short(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024),
+        "peak_rss_mb": peak_rss_mb(),
+        "imported_rss_mb": imported,
         "task": task,
         "particles": scene.n_particles,
         "grid": scene.physics.grid,
@@ -188,6 +194,11 @@ def growth(args: argparse.Namespace, path: Path) -> None:
 
 def draw_growth(path: Path) -> None:
     """Time and memory against each knob."""
+    # Here, so that what is measured does not carry them.
+    from matplotlib.ticker import NullLocator
+
+    from rpg.figures import curve, new_figure, save, short_count, style_axes
+
     lines = [line for line in recorded(path) if "knob" in line]
     fig, axes = new_figure(2, len(GROWTH), width=2.6, height=2.3)
     for (knob, (label, _, _)), speed, memory in zip(GROWTH.items(), axes[:4], axes[4:], strict=True):

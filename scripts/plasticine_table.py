@@ -43,7 +43,7 @@ class SolveJob(Job):
     def command(self) -> list[str]:
         """The `rpg-solve` command."""
         return [
-            sys.executable, "-m", "rpg.solve", *self.overrides, f"threads={self.threads}", f"run_dir={self.folder}",
+            sys.executable, "-m", "rpg.solve", *self.overrides, f"threads={self.threads}", f"run_dir='{self.folder}'",
         ]  # fmt: skip
 
 

@@ -141,13 +141,14 @@ class Scene:
         """mu, lambda and yield stress of every particle, (N, 3) or (B, N, 3); arguments as in `initial_state`.
 
         Raises:
-            RPGError: it is so stiff that the time step is unstable.
+            RPGError: a value is out of its range, or so stiff that the time step is unstable.
         """
         given = [
             own if value is None else torch.as_tensor(value, dtype=torch.float64, device=self.device)
             for value, own in zip((E, nu, yield_stress), self._elasticity.unbind(-1), strict=True)
         ]
         E_, nu_, yields = torch.broadcast_tensors(*given, self._elasticity[:, 0])[:3]
+        guard.check_material(E_, nu_, yields, self.name)
         mu, lam = E_ / (2 * (1 + nu_)), E_ * nu_ / ((1 + nu_) * (1 - 2 * nu_))
         material = torch.stack([mu, lam, yields], -1).to(self.dtype)
         if not self.config.unstable:

@@ -29,12 +29,16 @@ class Transition(NamedTuple):
 
 
 class Episode(NamedTuple):
-    """A finished episode: undiscounted return, length in decisions, success at its end and at any time."""
+    """A finished episode: undiscounted return, length in decisions, success at its end and at any time.
+
+    ``score`` is the task's own measure at the end, for tasks that have one (``info["score"]``).
+    """
 
     ret: float
     length: int
     success_end: bool
     success_ever: bool
+    score: float | None = None
 
 
 class Runner:
@@ -116,8 +120,15 @@ class Runner:
         self._length += 1
         self._ever |= success
         ended = np.logical_or(terminated, truncated)
+        score = info.get("score")
         episodes = [
-            Episode(float(self._return[i]), int(self._length[i]), bool(success[i]), bool(self._ever[i]))
+            Episode(
+                float(self._return[i]),
+                int(self._length[i]),
+                bool(success[i]),
+                bool(self._ever[i]),
+                None if score is None else float(score[i]),
+            )
             for i in np.flatnonzero(ended)
         ]
         self._obs = next_obs
@@ -213,12 +224,14 @@ class Runner:
 
 
 def summarize(episodes: list[Episode], prefix: str) -> dict[str, float]:
-    """Mean return, length and success rates under ``prefix``; empty without episodes."""
+    """Mean return, length, success rates and, where there is one, score under ``prefix``; empty without episodes."""
     if not episodes:
         return {}
     columns = np.array([[e.ret, e.length, e.success_end, e.success_ever] for e in episodes], dtype=float)
     names = ("return", "length", "success_end", "success_ever")
-    return {f"{prefix}/{name}": float(v) for name, v in zip(names, columns.mean(0), strict=True)}
+    means = {f"{prefix}/{name}": float(v) for name, v in zip(names, columns.mean(0), strict=True)}
+    scores = [e.score for e in episodes if e.score is not None]
+    return means | ({f"{prefix}/score": float(np.mean(scores))} if scores else {})
 
 
 def evaluate(

@@ -210,6 +210,30 @@ def test_unstable_time_steps_are_refused() -> None:
     assert small(grid=32, dt=1.5e-4).physics.grid == 32
 
 
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"E": float("nan")}, "E=nan; must be positive and finite"),
+        ({"E": torch.tensor([[5e3], [-1.0]])}, "E=-1; must be positive"),
+        ({"nu": 0.5}, "nu=0.5; must be between -1 and 0.5"),
+        ({"yield_stress": float("nan")}, "yield_stress=nan; must be at least 0"),
+    ],
+)
+def test_material_out_of_range_is_refused(given: dict[str, Any], message: str) -> None:
+    with pytest.raises(RPGError, match=f"writer-v1: {message}"):
+        small().initial_state(batch=2, **given)
+    assert small().initial_state(yield_stress=math.inf).material[0, 0, 2] == math.inf
+
+
+def test_of_a_batch_that_blows_up_the_scene_is_named() -> None:
+    scene = small()
+    state = scene.initial_state(batch=3)
+    x = state.particles.x.clone()
+    x[1, 7] = float("inf")
+    with pytest.raises(NonFiniteError, match="1 of 600 particles are not finite in scene 1 of 3, already in"):
+        scene.step(state._replace(particles=state.particles._replace(x=x)), torch.zeros(3))
+
+
 def test_a_scene_that_blows_up_says_where() -> None:
     scene = small("move", dt=3e-3, substeps=19, unstable=True)
     with pytest.raises(NonFiniteError) as caught:

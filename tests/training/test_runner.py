@@ -153,6 +153,17 @@ def test_summary_is_the_mean_of_every_column() -> None:
     assert summarize([], "eval") == {}
 
 
+def test_a_task_with_a_score_of_its_own_has_it_summed_up() -> None:
+    class Judged(Clock):
+        def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+            *rest, _ = super().step(action)
+            return (*rest, {"score": 0.1 * float(rest[1])})  # type: ignore[return-value]
+
+    runner = started(lambda: Judged(2))
+    episodes = [e for _ in range(2) for e in runner.step()[1]]
+    assert summarize(episodes, "train")["train/score"] == pytest.approx(0.2)
+
+
 def test_environments_that_reset_themselves_are_refused() -> None:
     envs = SyncVectorEnv([lambda: Clock(3)], autoreset_mode=AutoresetMode.NEXT_STEP)
     with pytest.raises(RPGError, match="clock: autoreset mode"):
