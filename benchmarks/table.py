@@ -21,6 +21,10 @@ REFERENCES = [
     ["published, no predictor step", "2 CPU cores", "", "float32", "no", "3.5", "", "", "", "", "", ""],
     ["published", "2 CPU cores", "", "float32", "no", "about 3.3", "", "13.3 to 16.2", "", "", "", ""],
 ]
+PLASTICINE_REFERENCES = [
+    ["public release, Move", "2 CPU cores", "2", "float64", "10,000", "215", "590", "330", "", "4,100", ""],
+    ["thesis, Table 2.2, Move", "GTX 1080 Ti", "", "", "10,000", "14.3", "35.6", "", "", "", ""],
+]
 IDENTITY = ("name", "cpu", "threads", "dtype", "compile", "overrides", "fill")
 DEFAULTS: Line = {"compile": False, "overrides": "", "fill": 0}  # of lines that do not say
 
@@ -111,6 +115,22 @@ def threading(lines: list[Line]) -> str:
     return markdown([*head.split(","), "commit"], rows)
 
 
+def simulating(lines: list[Line]) -> str:
+    """Soft bodies, one row a line, after the published numbers."""
+    head = (
+        "name,on,threads,dtype,particles,ms a step,ms with gradient,s to first gradient cold,warm,peak MB,commit"
+    )
+    numbers = ("particles", "forward_ms", "forward_backward_ms", "compile_s", "second_run_s", "peak_rss_mb")
+    rows = [
+        [
+            line["name"], line["cpu"], str(line["threads"]), line["dtype"],
+            *(number(line.get(key)) for key in numbers), line["commit"],
+        ]
+        for line in lines
+    ]  # fmt: skip
+    return markdown(head.split(","), [*PLASTICINE_REFERENCES, *rows] if rows else [])
+
+
 def tables(folder: Path) -> str:
     """What stands between the markers, from the files of ``folder``."""
     lines = newest(
@@ -122,6 +142,7 @@ def tables(folder: Path) -> str:
         ("Acting", "act/", acting),
         ("Replay", "replay", replaying),
         ("Threads", "threads/", threading),
+        ("Soft bodies", "plasticine/", simulating),
     ):
         text = write([line for line in lines if line["name"].startswith(kind)])
         parts += [f"### {title}", text] if text else []

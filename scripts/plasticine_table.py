@@ -29,9 +29,9 @@ from rpg.plasticine.scenes import scene_names
 from rpg.plasticine.solver import METHODS
 
 RUNS, OUT = Path("runs/solve"), Path("results/plasticine")
-_KEY = ["task", "variant", "method", "seed"]
-_COLUMNS = [*_KEY, "score", "episodes", "wall_s", "loss", "targets", "commit"]
-_CURVES = [*_KEY, "episode", "loss", "score"]
+KEY = ["task", "variant", "method", "seed"]
+COLUMNS = [*KEY, "score", "episodes", "wall_s", "loss", "targets", "commit"]
+CURVES = [*KEY, "episode", "loss", "score"]
 _PUBLISHED = Path("results/published/plasticine_table_2_1.csv")
 
 
@@ -74,8 +74,8 @@ def gather() -> Path:
     Raises:
         RPGError: there is no finished run and no table.
     """
-    table = Table(OUT / "table_2_1.csv", _COLUMNS, _KEY)
-    curves = Table(OUT / "curves.csv", _CURVES, [*_KEY, "episode"])
+    table = Table(OUT / "table_2_1.csv", COLUMNS, KEY)
+    curves = Table(OUT / "curves.csv", CURVES, [*KEY, "episode"])
     rows, lines = [], []
     for path in sorted(RUNS.glob("*/*/seed*/result.json")):
         origin = json.loads((path.parent / "run.json").read_text())
