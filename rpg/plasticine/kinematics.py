@@ -53,8 +53,16 @@ _TURN = _bilinear(
 _CONJUGATE = torch.tensor([1.0, -1.0, -1.0, -1.0], dtype=torch.float64)
 
 
+def _product(rows: Tensor, table: Tensor) -> Tensor:
+    """``rows @ table`` for tables this small.
+
+    A library's product starts threads for it, which then go on spinning where the simulator's are to run.
+    """
+    return (rows.unsqueeze(-1) * table).sum(-2)
+
+
 def _forms(a: Tensor, b: Tensor, table: Tensor) -> Tensor:
-    return (a.unsqueeze(-1) * b.unsqueeze(-2)).flatten(-2) @ table.to(a)
+    return _product((a.unsqueeze(-1) * b.unsqueeze(-2)).flatten(-2), table.to(a))
 
 
 def quaternion_product(a: Tensor, b: Tensor) -> Tensor:
@@ -146,7 +154,8 @@ class Rig:
         batch, tools = poses.shape[:2]
         if tools == 0:
             return poses, poses.new_zeros(batch, self.substeps, 0, MOTION_SIZE)
-        change = (action.to(self._changes).clamp(-1.0, 1.0) @ self._changes).unflatten(-1, (tools, _CHANGES))
+        change = _product(action.to(self._changes).clamp(-1.0, 1.0), self._changes)
+        change = change.unflatten(-1, (tools, _CHANGES))
         position, turn, gap = poses[..., :3], poses[..., 3:7], poses[..., 7:]
         path = self._path(position, turn, change)
         wide = (batch, self.substeps, tools)
