@@ -4,7 +4,7 @@
     python benchmarks/plasticine.py --task move --cold       # also how long until the first gradient with empty caches
     python benchmarks/plasticine.py --task all               # -> results/plasticine/table_2_2.csv
     python benchmarks/plasticine.py --task move --growth     # -> benchmarks/output/plasticine_growth.jsonl and .png
-    python benchmarks/plasticine.py --task torus --set dtype=float64 sweeps=6
+    python benchmarks/plasticine.py --task torus --set dtype=float64
 
 ``forward_ms`` simulates alone, under hard contact; ``forward_backward_ms`` is a rollout under soft contact with the
 loss of every step and the gradient of their sum for all actions. Actions are random and change at every step. Both

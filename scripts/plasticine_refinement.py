@@ -77,7 +77,7 @@ def scene_of(case: str, setting: Setting, dtype: str) -> Scene:
         "name": case, "gravity": [0.0, 0.0, 0.0], "tools": tools if case == "press" else [],
         "bodies": [{"shape": "ball", "size": [0.13], "centre": [0.5, 0.5, 0.5], "particles": _PARTICLES}],
         "grid": setting.grid, "substeps": setting.substeps, "dt": _STEP_S / setting.substeps,
-        "dtype": dtype, "sweeps": 6 if dtype == "float64" else 3, "yield_stress": CASES[case][1],
+        "dtype": dtype, "yield_stress": CASES[case][1],
     }  # fmt: skip
     return load_scene(given)
 

@@ -24,7 +24,7 @@ from rpg.plasticine.kinematics import POSE_SIZE, Rig
 from rpg.plasticine.losses import Loss, combine, contact_term, shape_terms
 from rpg.plasticine.physics import Dtype, Physics, Shape, Tool
 from rpg.plasticine.sampling import sample
-from rpg.plasticine.scenes import SceneConfig, load_config
+from rpg.plasticine.scenes import SWEEPS, SceneConfig, load_config
 from rpg.plasticine.score import Formula, normalised_increment, score_mass, soft_iou
 from rpg.plasticine.simulator import advance, grid_mass, make_backend
 from rpg.plasticine.state import Rollout, State
@@ -85,7 +85,7 @@ class Scene:
             gravity=cast("tuple[float, float, float]", tuple(config.gravity)),
             floor_friction=config.floor_friction,
             dtype=cast(Dtype, config.dtype),
-            sweeps=config.sweeps,
+            sweeps=SWEEPS.get(config.dtype, 1) if config.sweeps is None else config.sweeps,
         )
         self.dtype: torch.dtype = getattr(torch, config.dtype)
         self.device = config.device

@@ -17,8 +17,11 @@ from rpg.errors import RPGError, nearest
 PRESETS: dict[str, dict[str, Any]] = {
     "default": {},
     "fast": {"sweeps": 2},
-    "exact": {"dtype": "float64", "sweeps": 6},
+    "exact": {"dtype": "float64"},
 }
+
+# Sweeps of the eigenproblem that its adjoint needs to be as good as the dtype.
+SWEEPS = {"float32": 3, "float64": 6}
 
 BODY_SHAPES: dict[str, tuple[str, ...]] = {"box": ("edge_x", "edge_y", "edge_z"), "ball": ("radius",)}
 
@@ -100,7 +103,8 @@ class SceneConfig:
         target: name of the task in the files of targets, or a .npy file with the masses on a grid; null: no target.
         horizon: environment steps of an episode.
         softness: a of soft contact, strength exp(-a d); 0 is hard contact.
-        gravity, floor_friction, grid, dt, substeps, dtype, sweeps: see `rpg.plasticine.physics.Physics`.
+        gravity, floor_friction, grid, dt, substeps, dtype: see `rpg.plasticine.physics.Physics`.
+        sweeps: likewise; null takes what the dtype needs, `SWEEPS`.
         particles: total number, shared out as the bodies' own numbers are; null keeps those. Masses of bodies stay.
         E, nu, yield_stress: for all bodies; null keeps each body's own.
         seed: of the random positions of particles; the published tasks have 0.
@@ -123,7 +127,7 @@ class SceneConfig:
     dt: float = 1e-4
     substeps: int = 19
     dtype: str = "float32"
-    sweeps: int = 3
+    sweeps: int | None = None
     particles: int | None = None
     E: float | None = None
     nu: float | None = None

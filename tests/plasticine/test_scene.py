@@ -39,7 +39,7 @@ def small(task: str = "writer", **overrides: Any) -> Scene:
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 @pytest.mark.parametrize("key", list(RUNS))
 def test_motion_of_the_public_release(key: str, dtype: str) -> None:
-    """Within 2 % of the body's size over 25 steps: mean and both ends of the body, hard contact."""
+    """Within 2 % of the body's size over 50 steps: mean and both ends of the body, hard contact."""
     task, variant = key.split("-v")
     public = ENV_VAR in os.environ
     scene = load_scene(
@@ -53,7 +53,7 @@ def test_motion_of_the_public_release(key: str, dtype: str) -> None:
     first = scene.loss(state).total
     records = {record["t"]: record for record in RUNS[key]["steps"]}
     size = max(high - low for low, high in zip(records[0]["lo"], records[0]["hi"], strict=True))
-    for t in range(25):
+    for t in range(50):
         action = [0.8 * math.sin(2 * math.pi * (t / 25 + k / n)) for k in range(n)]
         with torch.no_grad():
             state = scene.step(state, torch.tensor(action), softness=0.0)

@@ -78,7 +78,7 @@ def test_a_file_of_ones_own(mine: str) -> None:
 
 
 def test_later_settings_win(mine: str) -> None:
-    assert load_config(mine, 1, "exact").sweeps == PRESETS["exact"]["sweeps"]
+    assert load_config(mine, 1, "fast").sweeps == PRESETS["fast"]["sweeps"]
     assert load_config(mine, 1, "exact", {"sweeps": 9}).sweeps == 9
 
 
