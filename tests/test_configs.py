@@ -23,7 +23,12 @@ CONF = Path(rpg.conf.__file__).parent
 AGENTS = sorted(p.stem for p in (CONF / "agent").glob("*.yaml"))
 OPTIONS = sorted((p.parent.name, p.stem) for p in CONF.glob("*/*.yaml") if p.parent.name != "agent")
 # What tells from a log row that an agent learned.
-LEARNERS = {"rpg": "loss/state", "mbsac": "loss/state", "sac": "train/critic_grad_norm", "tdmpc": "loss/state"}
+LEARNERS = {
+    "rpg": "loss/state",
+    "mbsac": "loss/state",
+    "sac": "train/critic_grad_norm",
+    "tdmpc": "loss/state",
+}
 
 
 @pytest.mark.parametrize(("group", "option"), OPTIONS, ids=[f"{g}={o}" for g, o in OPTIONS])
@@ -118,7 +123,12 @@ def test_every_agent_runs_the_debug_preset(composed: Composed, tmp_path: Path, a
 
 @pytest.mark.parametrize("agent", sorted(LEARNERS))
 def test_every_learner_runs_without_and_with_the_other_bonus(composed: Composed, agent: str) -> None:
-    quick = ["trainer.steps=60", "trainer.seed_decisions=40", "trainer.picture_every=0", "trainer.eval_every=0"]
+    quick = [
+        "trainer.steps=60",
+        "trainer.seed_decisions=40",
+        "trainer.picture_every=0",
+        "trainer.eval_every=0",
+    ]
     row = train(composed("experiment=debug", f"agent={agent}", "exploration=plan2explore", *quick))
     assert row["updates"] > 0
     assert row["loss/ensemble"] > 0
