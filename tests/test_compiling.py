@@ -66,17 +66,19 @@ def make_density() -> RandomNetworkDistillation:
 def batches(agent: Agent, n: int) -> Iterator[SegmentBatch]:
     generator = torch.Generator().manual_seed(2)
 
+    k = agent.horizon
+
     def uniform(*shape: int) -> torch.Tensor:
         return torch.rand(*shape, generator=generator)
 
     for _ in range(n):
         yield SegmentBatch(
             obs=uniform(BATCH, 3),
-            next_obs=uniform(3, BATCH, 3),
-            action=2 * uniform(3, BATCH, 2) - 1,
-            reward=uniform(3, BATCH),
-            terminated=(uniform(3, BATCH) < 0.2).float(),
-            mask=(uniform(3, BATCH) < 0.8).float().cumprod(0),
+            next_obs=uniform(k, BATCH, 3),
+            action=2 * uniform(k, BATCH, 2) - 1,
+            reward=uniform(k, BATCH),
+            terminated=(uniform(k, BATCH) < 0.2).float(),
+            mask=(uniform(k, BATCH) < 0.8).float().cumprod(0),
             latent=uniform(BATCH, agent.latent_dim),
             step=(4 * uniform(BATCH)).floor(),
         )
@@ -186,22 +188,18 @@ def test_baselines_compiled_and_plain_learn_the_same_and_nothing_compiles_twice(
     plain, plain_bonus = baseline(name)
     compiled, bonus = baseline(name)
     compiled.compile()
-    bonus.compile()
-    steps = [cut(batch, plain.horizon) for batch in batches(plain, 12)]
+    if name == "sac":  # once is enough
+        bonus.compile()
+    steps = list(batches(plain, 12))
     expected = practise(plain, plain_bonus, steps)
     got = practise(compiled, bonus, steps[:2])
     with torch.compiler.set_stance("fail_on_recompile"):
         got += practise(compiled, bonus, steps[2:], start=2)
     assert compiling.LOG.failed == {}
-    for i, (a, b) in enumerate(zip(expected[:2], got, strict=False)):
+    for i, (a, b) in enumerate(zip(expected, got, strict=True)):
         assert a.keys() == b.keys()
-        for key in a:
+        for key in a.keys() - ({"action"} if name == "tdmpc" and i > 1 else set()):  # a search may tip over
             torch.testing.assert_close(b[key], a[key], rtol=2e-3, atol=2e-4, msg=f"{key} at update {i}")
-
-
-def cut(batch: SegmentBatch, horizon: int) -> SegmentBatch:
-    """The first steps of longer segments."""
-    return SegmentBatch(*(x[:horizon] if x is not None and x.ndim > 1 and len(x) == 3 else x for x in batch))
 
 
 @needs_compiler
