@@ -65,7 +65,6 @@ def make_density() -> RandomNetworkDistillation:
 
 def batches(agent: Agent, n: int) -> Iterator[SegmentBatch]:
     generator = torch.Generator().manual_seed(2)
-
     k = agent.horizon
 
     def uniform(*shape: int) -> torch.Tensor:
@@ -156,8 +155,8 @@ def baseline(name: str) -> tuple[Agent, Plan2Explore]:
     if name == "sac":
         agent = SAC(observations, actions, SACConfig(width=16, batch_size=BATCH))
     else:
-        search = PlannerConfig(samples=12, elites=4, iterations=2, policy_share=0.2)
-        sizes = {"state_dim": 8, "width": 16, "encoder_width": 16, "batch_size": BATCH, "horizon": 3}
+        search = PlannerConfig(samples=12, elites=4, iterations=1, policy_share=0.2)
+        sizes = {"state_dim": 8, "width": 16, "encoder_width": 16, "batch_size": BATCH, "horizon": 2}
         agent = TDMPC(observations, actions, TDMPCConfig(search, schedule_steps=10, **sizes))
     config = Plan2ExploreConfig(width=16, batch_size=16, warmup=3, members=2)
     return agent, Plan2Explore(agent, config)
