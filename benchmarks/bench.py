@@ -34,7 +34,7 @@ _OPTIONS = {"agent.precision": "dtype"} | {
 def options(doc: str | None, **defaults: Any) -> argparse.ArgumentParser:
     """A parser with the options of every benchmark; ``defaults`` replace theirs."""
     parser = argparse.ArgumentParser(description=(doc or "").splitlines()[0])
-    parser.add_argument("--agent", default="rpg", help="rpg or mbsac")
+    parser.add_argument("--agent", default="rpg", help="rpg, mbsac, sac or tdmpc")
     parser.add_argument("--size", default="paper", help="paper or fast")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--dtype", default="float32", choices=["float32", "tf32", "bfloat16"])

@@ -51,9 +51,7 @@ def prepare(trainer: Trainer, run: RunConfig, fill: int = 0) -> None:
 
 def block(run: RunConfig) -> int:
     """How many updates it takes until each kind has had its share."""
-    return math.lcm(
-        4, run.agent.actor_every, run.agent.world_model.target_every, run.exploration.update_every
-    )
+    return math.lcm(4, run.agent.cycle, run.exploration.update_every)
 
 
 def schedule(run: RunConfig) -> tuple[int, int]:
@@ -129,7 +127,7 @@ def measure(args: argparse.Namespace) -> Line:
         "copy_gb_per_s": short(copy_gb_per_s(run.device)),
         "peak_memory_mb": short(memory),
         "batch_size": run.agent.batch_size,
-        "horizon": run.agent.world_model.horizon,
+        "horizon": trainer.agent.horizon,
         "num_envs": run.env.num_envs,
         "fill": args.fill,
     }

@@ -7,6 +7,7 @@ and the mixing into a target copy are one kernel each, on any device, without sy
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -91,3 +92,36 @@ class FlatAdam(FlatParameters):
         """Continue from :meth:`state_dict`."""
         for name in ("mean", "square", "count"):
             getattr(self, name).copy_(state[name])
+
+
+class FlatGroup:
+    """Several modules whose parameters are read from their flat vectors while a function of them runs.
+
+    Gradients of such a function then go to the vectors, and whoever asks for one vector's gets no other's.
+
+    Args:
+        parts: module and its parameters, by a name of your choice.
+    """
+
+    def __init__(self, **parts: tuple[nn.Module, FlatParameters]) -> None:
+        self._flats = {name: flat for name, (_, flat) in parts.items()}
+        self._nets = _Caller({name: module for name, (module, _) in parts.items()})
+
+    def run(self, function: Callable[..., Any], *args: Any) -> Any:
+        """Call ``function``, which may use any of the modules."""
+        views: dict[str, Tensor] = {}
+        for name, flat in self._flats.items():
+            views |= flat.views(flat.vector, f"{name}.")
+        return torch.func.functional_call(self._nets, views, (function, *args))
+
+
+class _Caller(nn.Module):
+    """Makes any function one that can be run with other parameters in these modules."""
+
+    def __init__(self, modules: dict[str, nn.Module]) -> None:
+        super().__init__()
+        for name, module in modules.items():
+            self.add_module(name, module)
+
+    def forward(self, function: Callable[..., Any], *args: Any) -> Any:
+        return function(*args)

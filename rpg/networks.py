@@ -1,4 +1,4 @@
-"""The two network shapes everything is built from."""
+"""The network shapes everything is built from."""
 
 from __future__ import annotations
 
@@ -18,12 +18,13 @@ ACTIVATIONS: dict[str, Callable[[], nn.Module]] = {
 """ELU is the published one; on a CPU SiLU, as smooth, costs less than half of it."""
 
 
-def mlp(in_dim: int, width: int, out_dim: int, activation: str = "elu") -> nn.Sequential:
-    """Two hidden layers (Sec. 3.5.1): in_dim - width - width - out_dim, orthogonal weights, zero bias."""
+def mlp(in_dim: int, width: int, out_dim: int, activation: str = "elu", hidden: int = 2) -> nn.Sequential:
+    """``hidden`` layers between input and output (Sec. 3.5.1: two), orthogonal weights, zero bias."""
     act = ACTIVATIONS[activation]
-    net = nn.Sequential(
-        nn.Linear(in_dim, width), act(), nn.Linear(width, width), act(), nn.Linear(width, out_dim)
-    )
+    layers: list[nn.Module] = []
+    for before in (in_dim, *[width] * (hidden - 1)):
+        layers += [nn.Linear(before, width), act()]
+    net = nn.Sequential(*layers, nn.Linear(width, out_dim))
     net.apply(_orthogonal)
     return net
 
@@ -34,29 +35,67 @@ def _orthogonal(module: nn.Module) -> None:
         nn.init.zeros_(module.bias)
 
 
-class TwinMLP(nn.Module):
-    """Two independent MLPs of equal shape evaluated as one batched product: (..., in_dim) -> (2, ...).
+class EnsembleMLP(nn.Module):
+    """Independent MLPs of equal shape evaluated as one batched product: (..., in_dim) -> (members, ..., out_dim).
 
-    Same layers and initialisation as :func:`mlp` with a scalar output.
+    Same layers and initialisation as :func:`mlp`.
+
+    Args:
+        in_dim: width of the input, which all members share.
+        width: of the two hidden layers.
+        out_dim: width of a member's output.
+        members: how many.
+        activation: see :data:`ACTIVATIONS`.
+        normalize: replace the first activation by layer normalisation and tanh, so that no input is too
+            large for the layers behind.
     """
 
-    def __init__(self, in_dim: int, width: int, activation: str = "elu") -> None:
+    def __init__(
+        self,
+        in_dim: int,
+        width: int,
+        out_dim: int,
+        members: int,
+        activation: str = "elu",
+        normalize: bool = False,
+    ) -> None:
         super().__init__()
+        self.members = members
         self.act = ACTIVATIONS[activation]()
-        twins = [[m for m in mlp(in_dim, width, 1) if isinstance(m, nn.Linear)] for _ in range(2)]
-        # Both first layers read the same input, so they are one wide layer; the later two are batched.
-        self.w1 = nn.Parameter(torch.cat([t[0].weight for t in twins]).detach().clone())
-        self.b1 = nn.Parameter(torch.zeros(2 * width))
-        self.w2 = nn.Parameter(torch.stack([t[1].weight.T for t in twins]).detach().clone())
-        self.b2 = nn.Parameter(torch.zeros(2, 1, width))
-        self.w3 = nn.Parameter(torch.stack([t[2].weight.T for t in twins]).detach().clone())
-        self.b3 = nn.Parameter(torch.zeros(2, 1, 1))
+        nets = [[m for m in mlp(in_dim, width, out_dim) if isinstance(m, nn.Linear)] for _ in range(members)]
+        # All first layers read the same input, so they are one wide layer; the later ones are batched.
+        self.w1 = nn.Parameter(torch.cat([net[0].weight for net in nets]).detach().clone())
+        self.b1 = nn.Parameter(torch.zeros(members * width))
+        self.w2 = nn.Parameter(torch.stack([net[1].weight.T for net in nets]).detach().clone())
+        self.b2 = nn.Parameter(torch.zeros(members, 1, width))
+        self.w3 = nn.Parameter(torch.stack([net[2].weight.T for net in nets]).detach().clone())
+        self.b3 = nn.Parameter(torch.zeros(members, 1, out_dim))
+        self.normalize = normalize
+        if normalize:
+            self.gain = nn.Parameter(torch.ones(members, width))
+            self.shift = nn.Parameter(torch.zeros(members, width))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Evaluate every member on ``x`` (..., in_dim); returns (members, ..., out_dim)."""
+        flat = x.reshape(-1, x.shape[-1])
+        hidden = F.linear(flat, self.w1, self.b1)  # (N, members * width)
+        if self.normalize:
+            hidden = F.layer_norm(hidden.view(len(flat), self.members, -1), self.gain.shape[1:])
+            hidden = (hidden * self.gain + self.shift).tanh()
+        else:
+            hidden = self.act(hidden)
+        hidden = hidden.view(len(flat), self.members, -1).transpose(0, 1)  # (members, N, width)
+        hidden = self.act(torch.baddbmm(self.b2, hidden, self.w2))
+        out: Tensor = torch.baddbmm(self.b3, hidden, self.w3)  # (members, N, out_dim)
+        return out.view(self.members, *x.shape[:-1], self.b3.shape[-1])
+
+
+class TwinMLP(EnsembleMLP):
+    """Two independent scalar MLPs: (..., in_dim) -> (2, ...)."""
+
+    def __init__(self, in_dim: int, width: int, activation: str = "elu", normalize: bool = False) -> None:
+        super().__init__(in_dim, width, 1, 2, activation, normalize)
 
     def forward(self, x: Tensor) -> Tensor:
         """Evaluate both heads on ``x`` (..., in_dim); returns (2, ...)."""
-        flat = x.reshape(-1, x.shape[-1])
-        hidden = self.act(F.linear(flat, self.w1, self.b1))  # (N, 2 * width)
-        hidden = hidden.view(flat.shape[0], 2, -1).transpose(0, 1)  # (2, N, width)
-        hidden = self.act(torch.baddbmm(self.b2, hidden, self.w2))
-        out: Tensor = torch.baddbmm(self.b3, hidden, self.w3)  # (2, N, 1)
-        return out.view(2, *x.shape[:-1])
+        return super().forward(x).squeeze(-1)

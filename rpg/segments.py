@@ -33,3 +33,8 @@ class SegmentBatch(NamedTuple):
     latent: Tensor
     step: Tensor
     bonus: Tensor | None = None
+
+    def total_reward(self, scale: float) -> Tensor:
+        """(K, N): the environment's reward times ``scale``, plus the bonus as it is."""
+        reward = self.reward * scale
+        return reward if self.bonus is None else reward + self.bonus

@@ -52,7 +52,7 @@ WRONG = {
     "agent.gamma=2": ["agent.gamma=2", "[0, 1]"],
     "agent.prior.mode=foo": ["agent.prior.mode='foo'", "policy_gradient"],
     "agent.name=foo": ["agent.name='foo'", "unknown agent"],
-    "exploration.name=foo": ["exploration.name='foo'", "rnd or none"],
+    "exploration.name=foo": ["exploration.name='foo'", "none, rnd, plan2explore"],
     "world_model.critic=z": ["world_model.critic='z'"],
     "trainer.steps=0": ["trainer.steps=0", "at least 1"],
     "seed=-1": ["seed=-1"],

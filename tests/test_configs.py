@@ -10,9 +10,9 @@ import pytest
 from omegaconf import DictConfig, OmegaConf
 
 import rpg.conf
-from rpg.agents import RPGConfig
+from rpg.agents import RPGConfig, SACConfig, TDMPCConfig
 from rpg.envs.registration import register_all
-from rpg.exploration import RNDConfig
+from rpg.exploration import Plan2ExploreConfig, RNDConfig
 from rpg.train import train
 from rpg.training.build import parse_config
 from rpg.training.config import LoggerConfig, TrainerConfig
@@ -22,7 +22,13 @@ Composed = Callable[..., DictConfig]
 CONF = Path(rpg.conf.__file__).parent
 AGENTS = sorted(p.stem for p in (CONF / "agent").glob("*.yaml"))
 OPTIONS = sorted((p.parent.name, p.stem) for p in CONF.glob("*/*.yaml") if p.parent.name != "agent")
-LEARNERS = {"rpg", "mbsac"}
+# What tells from a log row that an agent learned.
+LEARNERS = {
+    "rpg": "loss/state",
+    "mbsac": "loss/state",
+    "sac": "train/critic_grad_norm",
+    "tdmpc": "loss/state",
+}
 
 
 @pytest.mark.parametrize(("group", "option"), OPTIONS, ids=[f"{g}={o}" for g, o in OPTIONS])
@@ -46,6 +52,14 @@ def test_published_maze_is_the_defaults_in_code(composed: Composed) -> None:
     assert run.env.name == "maze"
 
 
+def test_paper_sizes_of_the_baselines_are_the_defaults_in_code(composed: Composed) -> None:
+    for agent, defaults in (("sac", SACConfig()), ("tdmpc", TDMPCConfig())):
+        run = parse_config(composed(f"agent={agent}", "size=paper", "env=gymnasium"))
+        assert run.agent == defaults
+    run = parse_config(composed("exploration=plan2explore", "size=paper", "env=gymnasium"))
+    assert run.exploration == Plan2ExploreConfig()
+
+
 def test_default_logger_is_the_one_in_code(composed: Composed) -> None:
     assert parse_config(composed("logger=tensorboard")).logger == LoggerConfig()
 
@@ -62,11 +76,18 @@ def leaves(tree: Any, prefix: str = "") -> set[str]:
 
 
 def test_every_setting_can_be_given_on_the_command_line(composed: Composed) -> None:
-    cfg = OmegaConf.to_container(composed("agent=rpg"), resolve=True)
-    assert isinstance(cfg, dict)
+    def settings(*overrides: str) -> dict[str, Any]:
+        cfg = OmegaConf.to_container(composed(*overrides), resolve=True)
+        assert isinstance(cfg, dict)
+        return cfg
+
+    cfg = settings("agent=rpg")
     agent = cfg["agent"] | {"world_model": cfg["world_model"]}
     assert leaves(agent) == leaves(asdict(RPGConfig())) | {".name"}
-    assert leaves(cfg["exploration"]) == leaves(asdict(RNDConfig())) | {".name"}
+    assert leaves(settings("agent=sac")["agent"]) == leaves(asdict(SACConfig())) | {".name"}
+    assert leaves(settings("agent=tdmpc")["agent"]) == leaves(asdict(TDMPCConfig())) | {".name"}
+    for bonus, defaults in (("rnd", RNDConfig()), ("plan2explore", Plan2ExploreConfig())):
+        assert leaves(settings(f"exploration={bonus}")["exploration"]) == leaves(asdict(defaults)) | {".name"}
     assert leaves(cfg["trainer"]) == leaves(asdict(TrainerConfig()))
 
 
@@ -94,6 +115,26 @@ def test_every_agent_runs_the_debug_preset(composed: Composed, tmp_path: Path, a
     row = train(composed("experiment=debug", f"agent={agent}", f"env={env}", *quick))
     assert row["env_steps"] == 60
     assert row["eval/deterministic/length"] == {"maze": 50, "gymnasium": 200, "bandit": 1}[env]
-    assert (row["updates"] > 0) == (agent in LEARNERS) == ("loss/state" in row) == ("loss/rnd" in row)
+    assert (row["updates"] > 0) == (agent in LEARNERS) == ("loss/rnd" in row)
+    assert LEARNERS.get(agent, "updates") in row
     assert ("loss/posterior" in row) == (agent == "rpg")
     assert (tmp_path / "run" / "checkpoint.pt").exists()
+
+
+@pytest.mark.parametrize("agent", sorted(LEARNERS))
+def test_every_learner_runs_without_and_with_the_other_bonus(composed: Composed, agent: str) -> None:
+    quick = [
+        "trainer.steps=60",
+        "trainer.seed_decisions=40",
+        "trainer.picture_every=0",
+        "trainer.eval_every=0",
+    ]
+    row = train(composed("experiment=debug", f"agent={agent}", "exploration=plan2explore", *quick))
+    assert row["updates"] > 0
+    assert row["loss/ensemble"] > 0
+    assert row["train/disagreement"] > 0
+    other = composed("experiment=debug", f"agent={agent}", "exploration=none", *quick)
+    other.run_dir += "_none"
+    bare = train(other)
+    assert LEARNERS[agent] in bare
+    assert {"loss/ensemble", "loss/rnd"}.isdisjoint(bare)

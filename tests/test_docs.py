@@ -15,9 +15,17 @@ from pathlib import Path
 import pytest
 import yaml
 
-from rpg.agents import LatentConfig, PriorConfig, RPGConfig, WorldModelConfig
+from rpg.agents import (
+    LatentConfig,
+    PlannerConfig,
+    PriorConfig,
+    RPGConfig,
+    SACConfig,
+    TDMPCConfig,
+    WorldModelConfig,
+)
 from rpg.envs.config import EnvConfig
-from rpg.exploration import RNDConfig
+from rpg.exploration import Plan2ExploreConfig, RNDConfig
 
 ROOT = Path(__file__).parents[1]
 PAGES = [
@@ -149,7 +157,9 @@ def test_every_page_is_in_the_navigation() -> None:
     [
         *(("docs/agents.md", schema) for schema in (RPGConfig, LatentConfig, PriorConfig, WorldModelConfig)),
         ("docs/environments.md", EnvConfig),
+        *(("docs/baselines.md", schema) for schema in (SACConfig, TDMPCConfig, PlannerConfig)),
         ("docs/exploration.md", RNDConfig),
+        ("docs/exploration.md", Plan2ExploreConfig),
     ],
 )
 def test_every_setting_is_in_its_table(page: str, schema: type) -> None:

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import nn
 
-from rpg.flat import FlatAdam, FlatParameters
+from rpg.flat import FlatAdam, FlatGroup, FlatParameters
 
 
 def network() -> nn.Sequential:
@@ -60,3 +60,20 @@ def test_state_goes_on_where_it_was() -> None:
     for grad in gradients[3:]:
         resumed.step(grad)
     assert torch.equal(straight.vector, resumed.vector)
+
+
+def test_a_group_gives_each_vector_the_gradient_of_its_own_module() -> None:
+    first, second = nn.Linear(2, 2), nn.Linear(2, 1)
+    flats = FlatParameters(first), FlatParameters(second)
+    group = FlatGroup(first=(first, flats[0]), second=(second, flats[1]))
+    x = torch.randn(5, 2)
+
+    def both(x: torch.Tensor) -> torch.Tensor:
+        return second(first(x)).sum()
+
+    assert torch.equal(group.run(both, x), both(x))
+    (grad,) = torch.autograd.grad(group.run(both, x), [flats[1].vector])
+    torch.testing.assert_close(grad, torch.cat([first(x).sum(0), torch.tensor([5.0])]))
+    (grad,) = torch.autograd.grad(group.run(both, x), [flats[0].vector])
+    expected = torch.cat([torch.outer(second.weight[0], x.sum(0)).flatten(), 5 * second.weight[0]])
+    torch.testing.assert_close(grad, expected)

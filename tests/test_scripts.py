@@ -86,3 +86,32 @@ def test_time_to_coverage_refuses_a_run_that_was_started_before(tmp_path: Path) 
     assert done.returncode != 0
     assert "was started before" in done.stderr
     assert not (tmp_path / "results").exists()
+
+
+def test_sac_is_checked_by_runs_that_are_not_repeated(tmp_path: Path) -> None:
+    script = str(ROOT / "scripts" / "check_sac.py")
+    words = ("run", "--implementations", "rpg", "--seeds", "0", "--steps", "1000")
+    assert "rpg seed 0: done" in run(tmp_path, script, *words)
+    assert run(tmp_path, script, *words) == ""
+    folder = tmp_path / "runs" / "check_sac" / "stable-baselines3" / "seed3"
+    folder.mkdir(parents=True)
+    (folder / "evaluations.json").write_text('[{"env_steps": 1000, "return": -1500.0, "wall_s": 9.5}]')
+    run(tmp_path, script, "gather")
+    with (tmp_path / "results" / "baselines" / "sac_pendulum.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["implementation"], row["seed"], row["env_steps"]) for row in rows] == [
+        ("rpg", "0", "1000"),
+        ("stable-baselines3", "3", "1000"),
+    ]
+    assert -2000 < float(rows[0]["return"]) < 0 < float(rows[0]["wall_s"])
+
+
+def test_sac_of_the_library_is_missed_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "stable_baselines3.py").write_text("raise ImportError")
+    done = subprocess.run(
+        [sys.executable, str(ROOT / "scripts" / "check_sac.py"), "learn", "--folder", "x", "--steps", "1000"],
+        cwd=tmp_path, env=os.environ | {"PYTHONPATH": f"{tmp_path}:{ROOT}"}, capture_output=True, text=True,
+        check=False,
+    )  # fmt: skip
+    assert done.returncode == 2
+    assert "pip install stable-baselines3" in done.stderr.splitlines()[-1]

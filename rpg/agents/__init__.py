@@ -3,16 +3,24 @@
 from rpg.agents.agent import Agent
 from rpg.agents.config import EntropyDecay, PriorConfig, RewardRamp, RPGConfig
 from rpg.agents.rpg import RPG
+from rpg.agents.sac import SAC, SACConfig
+from rpg.agents.tdmpc import TDMPC, TDMPCConfig
 from rpg.policies.latent import LatentConfig
 from rpg.world_model.config import WorldModelConfig
+from rpg.world_model.mppi import PlannerConfig
 
 __all__ = [
     "RPG",
+    "SAC",
+    "TDMPC",
     "Agent",
     "EntropyDecay",
     "LatentConfig",
+    "PlannerConfig",
     "PriorConfig",
     "RPGConfig",
     "RewardRamp",
+    "SACConfig",
+    "TDMPCConfig",
     "WorldModelConfig",
 ]

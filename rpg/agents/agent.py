@@ -65,6 +65,15 @@ class Agent:
         self._action_middle = (high + low) / 2
         self._action_half = (high - low) / 2
 
+    @property
+    def feature_dim(self) -> int:
+        """Width of :meth:`features`."""
+        return self.obs_dim
+
+    def features(self, obs: Tensor) -> Tensor:
+        """What the agent takes a state to be: (..., obs_dim) -> (..., feature_dim); observations if it has no other."""
+        return obs.float()
+
     def begin_episodes(self, obs: Tensor, mask: Tensor, latent: Tensor) -> Tensor:
         """Draw a new z where an episode begins, keep it elsewhere.
 
@@ -119,6 +128,10 @@ class Agent:
         finally:
             self._evaluating = False
             self.restore_episode_state(held)
+
+    def uniform(self, n: int) -> Tensor:
+        """I.i.d. uniform actions (n, action_dim) in [-1, 1)."""
+        return torch.rand(n, self.action_dim, device=self.device) * 2 - 1
 
     def to_env(self, action: Tensor) -> Tensor:
         """From (-1, 1) to the environment's bounds."""

@@ -1,7 +1,8 @@
-"""Settings of the RPG agent. The defaults are the published ones (Table 3.1 and the published code)."""
+"""Settings of the RPG agent: the published ones (Table 3.1 and the published code). And what all learners share."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -105,13 +106,35 @@ class EntropyDecay:
         return first + min(max(progress, 0.0), 1.0) * (self.to - first)
 
 
+class LearnerConfig:
+    """What the settings of all learning agents have in common.
+
+    Attributes:
+        batch_size: segments per update.
+        width: hidden width of the networks.
+    """
+
+    batch_size: int
+    width: int
+
+    @property
+    def cycle(self) -> int:
+        """Updates after which everything has happened that happens at every n-th of them."""
+        return 1
+
+    def _require(self, rule: str, holds: Callable[[float], bool], *names: str) -> None:
+        for name in names:  # NaN holds for no rule
+            if not holds(getattr(self, name)):
+                raise RPGError(f"agent.{name}={getattr(self, name)}: {rule}")
+
+
 _COUNTS = ("batch_size", "width", "actor_every", "actor_horizon", "target_horizon")
 _NOT_NEGATIVE = ("alpha", "beta", "horizon_decay", "observation_frequencies")
 _POSITIVE = ("lr", "grad_clip", "base_std", "max_alpha")
 
 
 @dataclass
-class RPGConfig:
+class RPGConfig(LearnerConfig):
     """Reparameterized Policy Gradient. An empty latent space makes it MBSAC.
 
     Args:
@@ -198,7 +221,7 @@ class RPGConfig:
                 "agent.prior.mode=regression: entropy_weight is the softmax temperature, must be > 0"
             )
 
-    def _require(self, rule: str, holds: Callable[[float], bool], *names: str) -> None:
-        for name in names:  # NaN holds for no rule
-            if not holds(getattr(self, name)):
-                raise RPGError(f"agent.{name}={getattr(self, name)}: {rule}")
+    @property
+    def cycle(self) -> int:
+        """Of policy and target network."""
+        return math.lcm(self.actor_every, self.world_model.target_every)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable
 from typing import Any
 
 import gymnasium as gym
@@ -16,7 +15,7 @@ from rpg.agents.config import RPGConfig
 from rpg.agents.prior import LatentPrior
 from rpg.compiling import compile_region, keep_address
 from rpg.exploration.objects import ObjectsOfInterest
-from rpg.flat import FlatAdam, FlatParameters
+from rpg.flat import FlatAdam, FlatGroup, FlatParameters
 from rpg.pixels import FrameShape
 from rpg.policies import LatentPolicy, LatentPosterior, make_latent_space
 from rpg.segments import SegmentBatch
@@ -33,17 +32,6 @@ class _Auxiliary(nn.Module):
         self.posterior = posterior
         self.log_alpha = nn.Parameter(torch.zeros(()))
         self.log_beta = nn.Parameter(torch.zeros(()))
-
-
-class _Networks(nn.Module):
-    """Everything learned, so that a function of it can be run with parameters from the flat vectors."""
-
-    def __init__(self, model: WorldModel, target: WorldModel, policy: LatentPolicy, aux: _Auxiliary) -> None:
-        super().__init__()
-        self.model, self.target, self.policy, self.aux = model, target, policy, aux
-
-    def forward(self, function: Callable[..., Any], *args: Any) -> Any:
-        return function(*args)
 
 
 class RPG(Agent):
@@ -94,7 +82,6 @@ class RPG(Agent):
         self._updates = 0
         self._actor_weights = horizon_weights(cfg.actor_horizon, cfg.horizon_decay)
         self._target_weights = horizon_weights(cfg.target_horizon, cfg.horizon_decay)
-        self._nets = _Networks(self.model, self.target, self.policy, self._aux)
         self._model_optimizer = FlatAdam(self.model, cfg.world_model.lr, cfg.world_model.grad_clip)
         self._target_vector = FlatParameters(self.target)
         self._policy_optimizer = FlatAdam(self.policy, cfg.lr, cfg.grad_clip)
@@ -102,6 +89,12 @@ class RPG(Agent):
         self._aux_optimizer = FlatAdam(self._aux, cfg.lr)
         self._model_region, self._policy_region = self._learn_model, self._learn_policy
         self._act_region = self._act
+        self._nets = FlatGroup(
+            model=(self.model, self._model_optimizer),
+            target=(self.target, self._target_vector),
+            policy=(self.policy, self._policy_optimizer),
+            aux=(self._aux, self._aux_optimizer),
+        )
 
     def compile(self) -> None:
         """Compile the learning step and acting; results are those of the plain functions up to rounding."""
@@ -111,6 +104,16 @@ class RPG(Agent):
         self._model_region = compile_region(self._learn_model, "world model", self.device)
         self._policy_region = compile_region(self._learn_policy, "policy", self.device)
         self._act_region = compile_region(self._act, "act", self.device)
+
+    @property
+    def feature_dim(self) -> int:
+        """Width of the latent state."""
+        return self.config.world_model.state_dim
+
+    def features(self, obs: Tensor) -> Tensor:
+        """Latent states (..., state_dim) of observations (..., obs_dim)."""
+        state: Tensor = self.model.encode(self._input(obs))
+        return state
 
     @property
     def alpha(self) -> Tensor:
@@ -183,9 +186,7 @@ class RPG(Agent):
         that may be compiled: the world model's step and the policy's.
         """
         cfg = self.config
-        reward = batch.reward * (cfg.reward_scale * cfg.reward_ramp.factor_at(env_steps))
-        if batch.bonus is not None:
-            reward = reward + batch.bonus
+        reward = batch.total_reward(cfg.reward_scale * cfg.reward_ramp.factor_at(env_steps))
         metrics = self._model_region(batch, reward, self._draw(cfg.target_horizon, reward.numel()))
         if self._updates % cfg.actor_every == 0:
             n = len(batch.obs)
@@ -211,20 +212,10 @@ class RPG(Agent):
     def _autocast(self) -> torch.autocast:
         return torch.autocast(self.device.type, torch.bfloat16, enabled=self.config.precision == "bfloat16")
 
-    def _run(self, function: Callable[..., Any], *args: Any) -> Any:
-        """Call ``function`` with every network's parameters cut from the flat vectors."""
-        views = {
-            **self._model_optimizer.views(self._model_optimizer.vector, "model."),
-            **self._target_vector.views(self._target_vector.vector, "target."),
-            **self._policy_optimizer.views(self._policy_optimizer.vector, "policy."),
-            **self._aux_optimizer.views(self._aux_optimizer.vector, "aux."),
-        }
-        return torch.func.functional_call(self._nets, views, (function, *args))
-
     def _learn_model(self, batch: SegmentBatch, reward: Tensor, noise: Tensor) -> Metrics:
         """Eq. 3.4: targets, losses, one step of Adam."""
         optimizer = self._model_optimizer
-        losses, target_values = self._run(self._model_terms, batch, reward, noise)
+        losses, target_values = self._nets.run(self._model_terms, batch, reward, noise)
         (grad,) = torch.autograd.grad(total_loss(losses, self.config.world_model), [optimizer.vector])
         norm = optimizer.step(grad)
         return {
@@ -281,7 +272,7 @@ class RPG(Agent):
         ``fresh`` (N, latent_dim) are newly drawn z: at an episode's first step z is still free.
         """
         cfg, optimizer = self.config, self._policy_optimizer
-        value, imagined, latent = self._run(self._policy_terms, batch, fresh, noise)
+        value, imagined, latent = self._nets.run(self._policy_terms, batch, fresh, noise)
         # Gradients of the policy alone: what flows through model and posterior is not accumulated there.
         (grad,) = torch.autograd.grad(-value.mean(), [optimizer.vector])
         norm = optimizer.step(grad)
@@ -313,7 +304,7 @@ class RPG(Agent):
         metrics: Metrics = {}
         terms = []
         if self.posterior is not None:
-            log_p = self._run(self._log_posterior, imagined, latent)
+            log_p = self._nets.run(self._log_posterior, imagined, latent)
             terms.append(-log_p)
             metrics = {"loss/posterior": -log_p.detach(), "train/beta": self.beta}
             if cfg.tune_beta:

@@ -20,11 +20,7 @@ class ScriptedPolicy(Agent):
     """I.i.d. uniform actions, and the base of the other two. ``deterministic`` is ignored by all of them."""
 
     def act(self, obs: Tensor, latent: Tensor, deterministic: bool = False) -> Tensor:
-        return self.to_env(self._draw(len(obs)))
-
-    def _draw(self, n: int) -> Tensor:
-        """Actions (n, action_dim) in [-1, 1]."""
-        return torch.rand(n, self.action_dim, device=self.device) * 2 - 1
+        return self.to_env(self.uniform(len(obs)))
 
 
 class StickyPolicy(ScriptedPolicy):
@@ -61,7 +57,7 @@ class StickyPolicy(ScriptedPolicy):
         if len(self._age) != len(obs):
             self._allocate(len(obs))
         expired = self._age >= self.hold
-        self._action = torch.where(expired.unsqueeze(1), self._draw(len(obs)), self._action)
+        self._action = torch.where(expired.unsqueeze(1), self.uniform(len(obs)), self._action)
         self._age = self._age.masked_fill(expired, 0) + 1
         return self.to_env(self._action)
 
@@ -124,7 +120,7 @@ class BumpPolicy(ScriptedPolicy):
         ratio = (position - self._last).norm(dim=1) / self._action.norm(dim=1).clamp(min=1e-2)
         self._reach = torch.maximum(self._reach, ratio.masked_fill(self._fresh, 0.0).amax())
         redraw = self._fresh | (ratio < self.threshold * self._reach)
-        self._action = torch.where(redraw.unsqueeze(1), self._draw(len(obs)), self._action)
+        self._action = torch.where(redraw.unsqueeze(1), self.uniform(len(obs)), self._action)
         self._last = position.clone()
         self._fresh = torch.zeros_like(self._fresh)
         return self.to_env(self._action)

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from rpg.compiling import compile_region, keep_address
+from rpg.compiling import compile_region
 from rpg.errors import RPGError
-from rpg.exploration.normalizer import RunningNormalizer
+from rpg.exploration.bonus import Experience, ExplorationBonus, check_bonus
 from rpg.exploration.objects import ObjectSelector, ObjectsOfInterest
 from rpg.exploration.positional import encoded_dim, positional_encoding
 from rpg.flat import FlatAdam
@@ -53,19 +52,15 @@ class RNDConfig:
     relabel: bool = True
 
     def __post_init__(self) -> None:
-        if self.capacity < self.batch_size or self.batch_size < 1 or self.width < 1:
+        check_bonus(self)
+        if self.capacity < self.batch_size or self.frequencies < 0:
             raise RPGError(
                 f"exploration: capacity={self.capacity} must be at least batch_size={self.batch_size}, "
-                f"both and width={self.width} positive"
-            )
-        if not 0 <= self.forgetting < 1 or self.frequencies < 0 or self.lr <= 0 or self.update_every < 1:
-            raise RPGError(
-                f"exploration: forgetting={self.forgetting} must be in [0, 1), "
-                f"frequencies={self.frequencies} >= 0, lr={self.lr} > 0, update_every={self.update_every} >= 1"
+                f"frequencies={self.frequencies} at least 0"
             )
 
 
-class RandomNetworkDistillation:
+class RandomNetworkDistillation(ExplorationBonus):
     """Novelty of a state: how badly a trained network predicts a fixed random one there.
 
     Sees only the objects of interest, positionally encoded, and remembers them in a buffer of its own.
@@ -73,13 +68,15 @@ class RandomNetworkDistillation:
     segment is sampled, so old experience is judged by present novelty.
 
     Pictures are seen whole, and are not remembered here: they are too large to be kept twice, so
-    :meth:`update` is given some from the replay.
+    :meth:`update` takes some from the replay.
 
     Args:
         objects: which observation entries to look at, or the shape of pictures.
         config: sizes and weights.
         device: where networks and buffer live.
     """
+
+    config: RNDConfig
 
     def __init__(
         self,
@@ -95,51 +92,28 @@ class RandomNetworkDistillation:
             self._select, kept = ObjectSelector(objects).to(device), objects.dim
         self._target = _rnd_net(objects, config).to(device).requires_grad_(False)
         self._predictor = _rnd_net(objects, config).to(device)
-        self._normalizer = RunningNormalizer(config.forgetting, config.warmup).to(device)
-        self._optimizer = FlatAdam(self._predictor, config.lr)
-        self._device = torch.device(device)
+        super().__init__(config, FlatAdam(self._predictor, config.lr), device)
         self._buffer = torch.empty(config.capacity if self.remembers else 0, kept, device=device)
-        self._stored = 0
-        self._ticks = 0
         self._learn_region, self._bonus_region = self._learn, self._bonus
 
     def compile(self) -> None:
         """Compile predictor step and bonus; results are those of the plain functions up to rounding."""
-        optimizer = self._optimizer
-        keep_address(optimizer.vector, optimizer.mean, optimizer.square, optimizer.count)
-        keep_address(*self._normalizer.buffers())
+        super().compile()
         self._learn_region = compile_region(self._learn, "density", self._device)
         self._bonus_region = compile_region(self._bonus, "bonus", self._device)
 
     def observe(self, obs: Tensor) -> None:
         """Remember observations (n, obs_dim); pictures are only counted."""
+        if self.remembers:
+            picked = self._select(obs)
+            rows = (torch.arange(len(picked), device=self._device) + self._stored) % self.config.capacity
+            self._buffer[rows] = picked
+        super().observe(obs)
+
+    def _step(self, replay: Experience | None) -> dict[str, Tensor]:
         if not self.remembers:
-            self._stored += len(obs)
-            return
-        picked = self._select(obs)
-        rows = (torch.arange(len(picked), device=self._device) + self._stored) % self.config.capacity
-        self._buffer[rows] = picked
-        self._stored += len(picked)
-
-    @property
-    def ready(self) -> bool:
-        """Whether a full batch has been observed."""
-        return self._stored >= self.config.batch_size
-
-    def update(self, draw: Callable[[int], Tensor] | None = None) -> dict[str, Tensor]:
-        """One gradient step of the predictor on remembered observations; scalars stay on the device.
-
-        With ``update_every`` above 1 only every n-th call takes one; the others return nothing.
-
-        Args:
-            draw: gives so many past observations (n, obs_dim); asked where none are remembered here.
-        """
-        self._ticks += 1
-        if (self._ticks - 1) % self.config.update_every:
-            return {}
-        if not self.remembers:
-            assert draw is not None
-            return self._learn_region(draw(self.config.batch_size))
+            assert replay is not None
+            return self._learn_region(replay.observations(self.config.batch_size))
         filled = min(self._stored, self.config.capacity)
         rows = torch.randint(filled, (self.config.batch_size,), device=self._device)
         return self._learn_region(self._buffer[rows])
@@ -158,14 +132,16 @@ class RandomNetworkDistillation:
         """Attach the bonus of each step's next observation, as judged now."""
         return batch._replace(bonus=self._bonus_region(batch.next_obs))
 
+    def of_transition(self, obs: Tensor, action: Tensor, next_obs: Tensor) -> Tensor:
+        return self._bonus(next_obs)
+
     def bonus(self, obs: Tensor) -> Tensor:
         """Exploration reward (...) of observations (..., obs_dim), weighted by the coefficient."""
         return self._bonus(obs)
 
     @torch.no_grad()
     def _bonus(self, obs: Tensor) -> Tensor:
-        errors = self._normalizer(self.error(obs))
-        return self.config.coefficient * errors.clamp(-self.config.clip, self.config.clip)
+        return self._weighted(self.error(obs))
 
     @torch.no_grad()
     def error(self, obs: Tensor) -> Tensor:
@@ -180,24 +156,18 @@ class RandomNetworkDistillation:
 
     def state_dict(self) -> dict[str, Any]:
         """Tensors and plain data only; of the buffer only what is filled."""
-        return {
+        return super().state_dict() | {
             "target": self._target.state_dict(),
             "predictor": self._predictor.state_dict(),
-            "normalizer": self._normalizer.state_dict(),
-            "optimizer": self._optimizer.state_dict(),
             "buffer": self._buffer[: self._stored].clone(),
-            "stored": self._stored,
-            "ticks": self._ticks,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from :meth:`state_dict` of the same configuration."""
         self._target.load_state_dict(state["target"])
         self._predictor.load_state_dict(state["predictor"])
-        self._normalizer.load_state_dict(state["normalizer"])
-        self._optimizer.load_state_dict(state["optimizer"])
+        super().load_state_dict(state)
         self._buffer[: len(state["buffer"])] = state["buffer"]
-        self._stored, self._ticks = state["stored"], state["ticks"]
 
 
 def _rnd_net(objects: ObjectsOfInterest | FrameShape, config: RNDConfig) -> nn.Sequential:

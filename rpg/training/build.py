@@ -10,7 +10,8 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigKeyError, MissingMandatoryValue, OmegaConfBaseException
 
-from rpg.agents import RPG, Agent, RPGConfig
+from rpg.agents import Agent, RPGConfig
+from rpg.agents.learners import LEARNERS
 from rpg.agents.scripted import SCRIPTED, make_scripted
 from rpg.allocation import keep_freed_memory
 from rpg.compiling import compiler_missing
@@ -18,14 +19,26 @@ from rpg.conf import compose_config
 from rpg.envs.config import EnvConfig
 from rpg.envs.make import make_envs, objects_of_interest
 from rpg.errors import CheckpointError, RPGError, nearest
-from rpg.exploration import ObjectsOfInterest, RandomNetworkDistillation, RNDConfig
+from rpg.exploration import (
+    ExplorationBonus,
+    ObjectsOfInterest,
+    Plan2Explore,
+    Plan2ExploreConfig,
+    RandomNetworkDistillation,
+    RNDConfig,
+)
 from rpg.pixels import FrameShape
 from rpg.training.checkpoint import load_checkpoint
 from rpg.training.config import LoggerConfig, RunConfig, TrainerConfig
 from rpg.training.loggers import Loggers, Sink, TensorBoardSink, WandbSink
 from rpg.training.trainer import Trainer
 
-LEARNERS = ("rpg", "mbsac")
+EXPLORATIONS: dict[str, type[Any]] = {
+    "none": RNDConfig,  # which nobody reads
+    "rnd": RNDConfig,
+    "plan2explore": Plan2ExploreConfig,
+}
+"""Settings of the exploration bonuses by name."""
 
 
 def env_preset(name: str) -> EnvConfig:
@@ -54,12 +67,11 @@ def parse_config(cfg: DictConfig) -> RunConfig:
     name = agent.pop("name", None)
     if name not in (*LEARNERS, *SCRIPTED):
         raise RPGError(f"agent.name={name!r}: unknown agent; {nearest(str(name), (*LEARNERS, *SCRIPTED))}")
-    learner = name in LEARNERS
-    model = {"world_model": plain["world_model"]} if learner else {}
+    learner = LEARNERS.get(name)
     exploration = dict(plain["exploration"])
     exploration_name = exploration.pop("name", None)
-    if exploration_name not in ("rnd", "none"):
-        raise RPGError(f"exploration.name={exploration_name!r}: choose rnd or none")
+    if exploration_name not in EXPLORATIONS:
+        raise RPGError(f"exploration.name={exploration_name!r}: choose {', '.join(EXPLORATIONS)}")
     threads = plain.get("threads")
     if threads is not None and (not isinstance(threads, int) or threads < 1):
         raise RPGError(f"threads={threads!r}: a whole number of at least 1, or null")
@@ -67,18 +79,18 @@ def parse_config(cfg: DictConfig) -> RunConfig:
         raise RPGError(f"seed={plain.get('seed')!r}: must be a whole number, not negative")
     return RunConfig(
         agent_name=name,
-        agent=_section(RPGConfig, {**agent, **model}, "agent") if learner else RPGConfig(),
+        agent=_section(learner.config, learner.settings(agent, plain["world_model"]), "agent")
+        if learner
+        else RPGConfig(),
         agent_options={} if learner else agent,
         exploration_name=exploration_name if learner else "none",
-        exploration=_section(RNDConfig, exploration, "exploration")
-        if exploration_name == "rnd"
-        else RNDConfig(),
+        exploration=_section(EXPLORATIONS[exploration_name], exploration, "exploration"),
         env=_section(EnvConfig, plain["env"], "env"),
         trainer=_section(TrainerConfig, plain["trainer"], "trainer"),
         logger=_section(LoggerConfig, plain["logger"], "logger"),
         seed=plain["seed"],
         device=(device := _device(plain["device"])),
-        compile=_compile(plain.get("compile"), device) and learner,
+        compile=_compile(plain.get("compile"), device) and learner is not None,
         threads=threads,
         run_dir=plain["run_dir"],
         plain=plain,
@@ -144,7 +156,17 @@ def build_agent(run: RunConfig, envs: Any) -> tuple[Agent, ObjectsOfInterest]:
         return agent, ObjectsOfInterest.of(())
     Agent(obs_space, action_space)  # spaces are checked before their shape is used
     objects = ObjectsOfInterest.of(()) if frames else objects_of_interest(run.env, envs, obs_space.shape[0])
-    return RPG(obs_space, action_space, run.agent, objects, run.device), objects
+    build = LEARNERS[run.agent_name].build
+    return build(obs_space, action_space, run.agent, objects, run.device), objects
+
+
+def build_exploration(run: RunConfig, agent: Agent, objects: ObjectsOfInterest) -> ExplorationBonus | None:
+    """Make the bonus that the run asks for, if any."""
+    if run.exploration_name == "none":
+        return None
+    if isinstance(run.exploration, Plan2ExploreConfig):
+        return Plan2Explore(agent, run.exploration)
+    return RandomNetworkDistillation(agent.frames or objects, run.exploration, run.device)
 
 
 def build_trainer(run: RunConfig) -> Trainer:
@@ -162,13 +184,10 @@ def build_trainer(run: RunConfig) -> Trainer:
     np.random.seed(run.seed)  # some gymnasium environments draw from numpy's global generator
     envs = make_envs(run.env)
     agent, objects = build_agent(run, envs)
-    exploration = None
-    if run.exploration_name == "rnd":
-        exploration = RandomNetworkDistillation(agent.frames or objects, run.exploration, run.device)
     run_dir = Path(run.run_dir)
     trainer = Trainer(
         agent=agent,
-        exploration=exploration,
+        exploration=build_exploration(run, agent, objects),
         envs=envs,
         eval_envs=lambda: make_envs(run.env, run.trainer.eval_envs),
         config=run.trainer,

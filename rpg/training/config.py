@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from rpg.agents.config import RPGConfig
+from rpg.agents.config import LearnerConfig
 from rpg.envs.config import EnvConfig
 from rpg.errors import RPGError
-from rpg.exploration.rnd import RNDConfig
+from rpg.exploration import Plan2ExploreConfig, RNDConfig
 
 
 @dataclass
@@ -65,10 +65,10 @@ class RunConfig:
     """A whole run, validated."""
 
     agent_name: str
-    agent: RPGConfig
+    agent: LearnerConfig
     agent_options: dict[str, Any]
     exploration_name: str
-    exploration: RNDConfig
+    exploration: RNDConfig | Plan2ExploreConfig
     env: EnvConfig
     trainer: TrainerConfig
     logger: LoggerConfig

@@ -17,7 +17,7 @@ from rpg import compiling
 from rpg.agents.agent import Agent
 from rpg.envs.base import Restorable, Tracked
 from rpg.errors import NonFiniteError
-from rpg.exploration import RandomNetworkDistillation
+from rpg.exploration import ExplorationBonus
 from rpg.training.checkpoint import load_checkpoint, save_checkpoint
 from rpg.training.config import TrainerConfig
 from rpg.training.loggers import Loggers
@@ -51,7 +51,7 @@ class Trainer:
     def __init__(
         self,
         agent: Agent,
-        exploration: RandomNetworkDistillation | None,
+        exploration: ExplorationBonus | None,
         envs: VectorEnv[Any, Any, Any],
         eval_envs: Callable[[], VectorEnv[Any, Any, Any]],
         config: TrainerConfig,
@@ -176,7 +176,9 @@ class Trainer:
         transition, episodes = self._runner.step()
         bonus = None
         if self.exploration is not None and not self.exploration.config.relabel:
-            bonus = self.exploration.bonus(torch.as_tensor(transition.next_obs, device=self.agent.device))
+            bonus = self.exploration.of_transition(
+                self._tensor(transition.obs), transition.action, self._tensor(transition.next_obs)
+            )
         self._replay.add(*transition, bonus)
         self._watch(transition.next_obs)
         if episodes:
@@ -189,7 +191,10 @@ class Trainer:
         if self._tracker is not None:
             self._tracker.observe(observations)
         if self.exploration is not None:
-            self.exploration.observe(torch.as_tensor(observations, device=self.agent.device))
+            self.exploration.observe(self._tensor(observations))
+
+    def _tensor(self, array: np.ndarray) -> Tensor:
+        return torch.as_tensor(array, device=self.agent.device)
 
     def _ticks_due(self) -> int:
         if not self.config.decisions_per_update or not self.agent.batch_size:
@@ -199,7 +204,7 @@ class Trainer:
     def learn_once(self) -> None:
         """One update of the exploration bonus and, once enough is stored, of the agent."""
         if self.exploration is not None and self.exploration.ready:
-            self._add(self.exploration.update(self._replay.observations))
+            self._add(self.exploration.update(self._replay))
         if self.decisions > self.config.seed_decisions:
             self.update_agent()
 
