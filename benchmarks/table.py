@@ -117,7 +117,9 @@ def threading(lines: list[Line]) -> str:
 
 def simulating(lines: list[Line]) -> str:
     """Soft bodies, one row a line, after the published numbers."""
-    head = "name,on,threads,dtype,particles,ms a step,ms with gradient,s to first gradient cold,warm,peak MB,commit"
+    head = (
+        "name,on,threads,dtype,particles,ms a step,ms with gradient,s to first gradient cold,warm,peak MB,commit"
+    )
     numbers = ("particles", "forward_ms", "forward_backward_ms", "compile_s", "second_run_s", "peak_rss_mb")
     rows = [
         [
