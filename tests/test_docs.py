@@ -15,7 +15,14 @@ from pathlib import Path
 import pytest
 import yaml
 
-from rpg.agents import LatentConfig, PriorConfig, RPGConfig, WorldModelConfig
+from rpg.agents import (
+    CEMConfig,
+    LatentConfig,
+    PolicyConfig,
+    PriorConfig,
+    RPGConfig,
+    WorldModelConfig,
+)
 from rpg.envs.config import EnvConfig
 from rpg.exploration import RNDConfig
 
@@ -147,7 +154,10 @@ def test_every_page_is_in_the_navigation() -> None:
 @pytest.mark.parametrize(
     ("page", "schema"),
     [
-        *(("docs/agents.md", schema) for schema in (RPGConfig, LatentConfig, PriorConfig, WorldModelConfig)),
+        *(
+            ("docs/agents.md", schema)
+            for schema in (RPGConfig, LatentConfig, PolicyConfig, CEMConfig, PriorConfig, WorldModelConfig)
+        ),
         ("docs/environments.md", EnvConfig),
         ("docs/exploration.md", RNDConfig),
     ],
