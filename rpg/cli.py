@@ -182,7 +182,7 @@ def _values(override: Override) -> list[Any]:
     if override.is_sweep_override():
         return [str(v) for v in override.sweep_string_iterator()]
     value = override.value()
-    return ["null" if value is None else value]
+    return value if isinstance(value, list) else ["null" if value is None else value]
 
 
 def _compose(overrides: list[str], config: str) -> DictConfig:

@@ -85,16 +85,23 @@ def planned_runs(
 ) -> list[tuple[Path, int]]:
     """Folder and last env step of every run of a sweep."""
     texts = [a for a in args if not a.startswith("-") and ("=" in a or a.startswith("~"))]
-    overrides = OverridesParser.create().parse_overrides(texts)
-    choices = [
-        [f"{o.get_key_element()}={value}" for value in o.sweep_string_iterator()]
-        if o.is_sweep_override()
-        else [text]
-        for o, text in zip(overrides, texts, strict=True)
-    ]
+    parser = OverridesParser.create()
     runs = []
     with initialize_config_module("rpg.conf", version_base="1.3"):
-        for chosen in itertools.product(*choices):
+        fixed = [o.input_line or "" for o in parser.parse_overrides(texts) if not o.is_sweep_override()]
+        base = compose(config, overrides=fixed, return_hydra_config=True)
+        # An experiment may bring a sweep of its own; what is typed replaces it key by key, as in Hydra.
+        own = [f"{key}={values}" for key, values in (base.hydra.sweeper.params or {}).items()]
+        choices: dict[str, list[str]] = {}
+        for override in parser.parse_overrides([*own, *texts]):
+            key = override.get_key_element()
+            values = (
+                [f"{key}={value}" for value in override.sweep_string_iterator()]
+                if override.is_sweep_override()
+                else [override.input_line or ""]
+            )
+            choices[key] = values
+        for chosen in itertools.product(*choices.values()):
             cfg = compose(config, overrides=list(chosen), return_hydra_config=True)
             HydraConfig.instance().set_config(cfg)  # run_dir has the folder's name from there
             runs.append((Path(cfg.run_dir), int(OmegaConf.select(cfg, length))))

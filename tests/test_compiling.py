@@ -16,7 +16,9 @@ from rpg.agents import (
     SAC,
     TDMPC,
     Agent,
+    CEMConfig,
     PlannerConfig,
+    PolicyConfig,
     RPGConfig,
     SACConfig,
     TDMPCConfig,
@@ -229,3 +231,30 @@ def test_a_region_that_cannot_be_compiled_runs_plainly_and_says_so() -> None:
         assert float(region(torch.zeros(()))) == 1.0
     assert float(region(torch.ones(()))) == 2.0  # and stays quiet
     assert "unfit" in compiling.LOG.failed
+
+
+@needs_compiler
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize("kind", ["mixture", "flow", "cem"])
+def test_every_kind_of_policy_compiles_to_what_it_is(kind: str) -> None:
+    search = CEMConfig(samples=8, elites=3, iterations=2, proposals=2)
+    policy = PolicyConfig(kind, components=3, layers=2, cem=search)
+    plain, compiled = (make_agent(dynamics="residual", policy=policy) for _ in range(2))
+    compiled._policy_region = compiling.compile_region(compiled._learn_policy, f"{kind} policy", CPU)
+    compiled._act_region = compiling.compile_region(compiled._act, f"{kind} act", CPU)
+    if compiled._planner is not None:
+        compiled._planner.compile()
+    rows = []
+    for agent in (plain, compiled):
+        agent.begin_episodes(
+            torch.zeros(BATCH, 3), torch.ones(BATCH, dtype=torch.bool), torch.zeros(BATCH, 12)
+        )
+        row: dict[str, Any] = {}
+        for i, batch in enumerate(batches(agent, 3)):
+            torch.manual_seed(i)
+            row |= agent.update(batch, env_steps=i)
+            row["action"] = agent.act(batch.obs, batch.latent)
+        rows.append(row | {"policy": agent._policy_optimizer.vector.detach()})
+    assert not [name for name in compiling.LOG.failed if name.startswith(kind)]
+    for key, value in rows[0].items():
+        torch.testing.assert_close(rows[1][key], value, rtol=2e-3, atol=2e-4, msg=key)

@@ -21,7 +21,12 @@ Composed = Callable[..., DictConfig]
 
 CONF = Path(rpg.conf.__file__).parent
 AGENTS = sorted(p.stem for p in (CONF / "agent").glob("*.yaml"))
-OPTIONS = sorted((p.parent.name, p.stem) for p in CONF.glob("*/*.yaml") if p.parent.name != "agent")
+# Variants are RPG's alone, and tested with their figure.
+OPTIONS = sorted(
+    (p.parent.name, p.stem)
+    for p in CONF.glob("*/*.yaml")
+    if p.parent.name not in ("agent", "variant") and not p.stem.startswith("fig3_13")
+)
 # What tells from a log row that an agent learned.
 LEARNERS = {
     "rpg": "loss/state",

@@ -16,8 +16,10 @@ import pytest
 import yaml
 
 from rpg.agents import (
+    CEMConfig,
     LatentConfig,
     PlannerConfig,
+    PolicyConfig,
     PriorConfig,
     RPGConfig,
     SACConfig,
@@ -155,7 +157,10 @@ def test_every_page_is_in_the_navigation() -> None:
 @pytest.mark.parametrize(
     ("page", "schema"),
     [
-        *(("docs/agents.md", schema) for schema in (RPGConfig, LatentConfig, PriorConfig, WorldModelConfig)),
+        *(
+            ("docs/agents.md", schema)
+            for schema in (RPGConfig, LatentConfig, PolicyConfig, CEMConfig, PriorConfig, WorldModelConfig)
+        ),
         ("docs/environments.md", EnvConfig),
         *(("docs/baselines.md", schema) for schema in (SACConfig, TDMPCConfig, PlannerConfig)),
         ("docs/exploration.md", RNDConfig),

@@ -5,6 +5,7 @@ from rpg.agents.config import EntropyDecay, PriorConfig, RewardRamp, RPGConfig
 from rpg.agents.rpg import RPG
 from rpg.agents.sac import SAC, SACConfig
 from rpg.agents.tdmpc import TDMPC, TDMPCConfig
+from rpg.policies.config import CEMConfig, PolicyConfig
 from rpg.policies.latent import LatentConfig
 from rpg.world_model.config import WorldModelConfig
 from rpg.world_model.mppi import PlannerConfig
@@ -14,9 +15,11 @@ __all__ = [
     "SAC",
     "TDMPC",
     "Agent",
+    "CEMConfig",
     "EntropyDecay",
     "LatentConfig",
     "PlannerConfig",
+    "PolicyConfig",
     "PriorConfig",
     "RPGConfig",
     "RewardRamp",

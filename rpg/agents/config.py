@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from rpg.errors import RPGError
+from rpg.policies.config import PolicyConfig
 from rpg.policies.latent import LatentConfig
 from rpg.world_model.config import WorldModelConfig
 
@@ -153,7 +154,8 @@ class RPGConfig(LearnerConfig):
             published runs; 0 keeps the one-step estimate alone.
         actor_value: which value head the policy climbs: ``first`` (published), ``mean`` or ``min``.
         entropy_in_target: whether value targets contain -alpha log pi (the published runs left it out).
-        base_std: action std at log-std 0.
+        policy: what pi(a|s, z) is.
+        base_std: action std at log-std 0, before tanh.
         noise_correlation: correlation of the action noise from one decision to the next while acting. 0 is
             independent noise, as published. Above 0 a deviation lasts, so it leads somewhere; the density
             of each single action stays that of pi(a|s, z), and learning is unchanged.
@@ -186,6 +188,7 @@ class RPGConfig(LearnerConfig):
     horizon_decay: float = 0.97
     actor_value: str = "first"
     entropy_in_target: bool = False
+    policy: PolicyConfig = field(default_factory=PolicyConfig)
     base_std: float = 0.4
     noise_correlation: float = 0.0
     alpha: float = 0.01

@@ -11,7 +11,10 @@ import torch
 from torch import Tensor, nn
 
 from rpg.agents.agent import Agent, Metrics
+from rpg.agents.cem import CEMPlanner
 from rpg.agents.config import RPGConfig
+from rpg.agents.networks import Auxiliary
+from rpg.agents.noise import ActionNoise
 from rpg.agents.prior import LatentPrior
 from rpg.compiling import compile_region, keep_address
 from rpg.exploration.objects import ObjectsOfInterest
@@ -21,17 +24,8 @@ from rpg.policies import LatentPolicy, LatentPosterior, make_latent_space
 from rpg.segments import SegmentBatch
 from rpg.world_model import ObservationInput, WorldModel
 from rpg.world_model.loss import ModelLosses, model_losses, total_loss
+from rpg.world_model.mixture import component_gain
 from rpg.world_model.rollout import Imagined, horizon_weights, imagine, shaped_reward, value_estimate
-
-
-class _Auxiliary(nn.Module):
-    """p_phi(z|s, a) and the logarithms of alpha's and beta's tuned factors."""
-
-    def __init__(self, posterior: LatentPosterior | None) -> None:
-        super().__init__()
-        self.posterior = posterior
-        self.log_alpha = nn.Parameter(torch.zeros(()))
-        self.log_beta = nn.Parameter(torch.zeros(()))
 
 
 class RPG(Agent):
@@ -66,19 +60,21 @@ class RPG(Agent):
             inputs = self._input.dim
         state_dim, act = cfg.world_model.state_dim, cfg.world_model.activation
         self.model = WorldModel(inputs, self.action_dim, self.latent_dim, cfg.world_model)
-        self.policy = LatentPolicy(state_dim, self.latent_dim, self.action_dim, cfg.width, cfg.base_std, act)
+        self.policy = LatentPolicy(
+            state_dim, self.latent_dim, self.action_dim, cfg.width, cfg.base_std, act, cfg.policy
+        )
         self.posterior = (
             LatentPosterior(state_dim, self.action_dim, self.space, cfg.width, act)
             if self.latent_dim
             else None
         )
-        self._aux = _Auxiliary(self.posterior)
+        self._aux = Auxiliary(self.posterior)
         for net in (self._input, self.model, self.policy, self._aux):
             net.to(self.device)
         self.target = copy.deepcopy(self.model)
         obs_dtype = torch.uint8 if self.frames else torch.float32
         self.prior = LatentPrior(self.space, state_dim, self.obs_dim, cfg, self.device, obs_dtype)
-        self._noise = torch.zeros(0, self.action_dim, device=self.device)
+        self._noise = ActionNoise(self.policy.noise_dim, cfg.noise_correlation, self.device)
         self._updates = 0
         self._actor_weights = horizon_weights(cfg.actor_horizon, cfg.horizon_decay)
         self._target_weights = horizon_weights(cfg.target_horizon, cfg.horizon_decay)
@@ -95,6 +91,10 @@ class RPG(Agent):
             policy=(self.policy, self._policy_optimizer),
             aux=(self._aux, self._aux_optimizer),
         )
+        self._planner: CEMPlanner | None = None
+        if cfg.policy.kind == "cem":
+            nets = (self.model, self.policy, self.posterior)
+            self._planner = CEMPlanner(cfg, *nets, lambda: self.beta, self.action_dim, self.device)
 
     def compile(self) -> None:
         """Compile the learning step and acting; results are those of the plain functions up to rounding."""
@@ -104,6 +104,8 @@ class RPG(Agent):
         self._model_region = compile_region(self._learn_model, "world model", self.device)
         self._policy_region = compile_region(self._learn_policy, "policy", self.device)
         self._act_region = compile_region(self._act, "act", self.device)
+        if self._planner is not None:
+            self._planner.compile()
 
     @property
     def feature_dim(self) -> int:
@@ -132,11 +134,9 @@ class RPG(Agent):
         """See :meth:`Agent.begin_episodes`; a learned pi(z|s1) also remembers the start states."""
         if not self._evaluating:
             self.prior.remember(obs[mask])
-        if self.config.noise_correlation:
-            fresh = torch.randn(len(obs), self.action_dim, device=self.device)
-            if len(self._noise) != len(obs):
-                self._noise = fresh
-            self._noise = torch.where(mask.unsqueeze(1), fresh, self._noise)
+        self._noise.begin(mask)
+        if self._planner is not None:
+            self._planner.begin(mask)
         return super().begin_episodes(obs, mask, latent)
 
     @torch.no_grad()
@@ -147,35 +147,31 @@ class RPG(Agent):
 
     @torch.no_grad()
     def act(self, obs: Tensor, latent: Tensor, deterministic: bool = False) -> Tensor:
-        """Draw a ~ pi(a|s, z), or take the mode of pi(.|s, z)."""
+        """Draw a ~ pi(a|s, z), or take the mode of pi(.|s, z); with ``policy.kind=cem`` search for a."""
+        if self._planner is not None:
+            noise = None if deterministic else self._noise.next(len(obs))
+            return self.to_env(self._planner.act(self._encoded(obs), latent, noise, self._evaluating))
         if deterministic:
             return self.to_env(self.policy(self.model.encode(self._input(obs)), latent).mode)
         # Evaluation has batches of another shape, for which nothing was compiled.
         act = self._act if self._evaluating else self._act_region
-        return act(obs, latent, self._next_noise(len(obs)))
+        return act(obs, latent, self._noise.next(len(obs)))
 
     @torch.no_grad()
     def _act(self, obs: Tensor, latent: Tensor, noise: Tensor) -> Tensor:
         distribution = self.policy(self.model.encode(self._input(obs)), latent)
         return self.to_env(distribution.rsample(noise)[0])
 
-    def _next_noise(self, n: int) -> Tensor:
-        """The next value of a stationary AR(1) process, of independent noise if its correlation is 0."""
-        rho = self.config.noise_correlation
-        fresh = torch.randn(n, self.action_dim, device=self.device)
-        if not rho:
-            return fresh
-        # Without begin_episodes there is nothing to be correlated with.
-        self._noise = fresh if len(self._noise) != n else rho * self._noise + math.sqrt(1 - rho**2) * fresh
-        return self._noise
-
     def episode_state(self) -> dict[str, Tensor]:
-        """The current action noise of every environment."""
-        return {"noise": self._noise.clone()}
+        """The current action noise of every environment, and where a search for actions goes on."""
+        state = {"noise": self._noise.value.clone()}
+        return state if self._planner is None else state | {"search": self._planner.warm.clone()}
 
     def restore_episode_state(self, state: dict[str, Tensor]) -> None:
         """Continue from :meth:`episode_state`."""
-        self._noise = state["noise"].to(self.device, copy=True)
+        self._noise.value = state["noise"].to(self.device, copy=True)
+        if self._planner is not None:
+            self._planner.warm = state["search"].to(self.device, copy=True)
 
     # -- learning --------------------------------------------------------------------------------------
 
@@ -207,7 +203,7 @@ class RPG(Agent):
     def _draw(self, horizon: int, n: int) -> Tensor:
         """Standard normal noise for the actions of ``n`` imagined rollouts, and for their bootstraps' own."""
         kinds = 2 if self.model.critic == "q" else 1
-        return torch.randn(kinds, horizon, n, self.action_dim, device=self.device)
+        return torch.randn(kinds, horizon, n, self.policy.noise_dim, device=self.device)
 
     def _autocast(self) -> torch.autocast:
         return torch.autocast(self.device.type, torch.bfloat16, enabled=self.config.precision == "bfloat16")
@@ -295,8 +291,19 @@ class RPG(Agent):
             imagined = imagine(self.model, self.policy, state, latent, cfg.actor_horizon, self.alpha, noise)
             shaped = shaped_reward(imagined, latent, self.posterior, self.alpha, self.beta)
             estimate = value_estimate(shaped, imagined.bootstrap, cfg.gamma, self._actor_weights)
-        value = {"first": estimate[0], "mean": estimate.mean(0), "min": estimate.min(0).values}
-        return value[cfg.actor_value], imagined, latent
+            value = self._climbed(estimate)
+            if cfg.policy.kind == "mixture":
+                weights = self.alpha, self.beta, cfg.gamma
+                nets = self.model, self.policy, self.posterior
+                value = value + component_gain(*nets, state, latent, *weights, noise[0, 0], self._climbed)
+        return value, imagined, latent
+
+    def _climbed(self, estimate: Tensor) -> Tensor:
+        """What the policy makes of both heads' estimates, (2, ...) -> (...)."""
+        kind = self.config.actor_value
+        return (
+            estimate[0] if kind == "first" else estimate.mean(0) if kind == "mean" else estimate.min(0).values
+        )
 
     def _learn_auxiliary(self, imagined: Imagined, latent: Tensor, entropy_target: Tensor) -> Metrics:
         """Maximum likelihood for p_phi(z|s, a) on imagined steps, and the two coefficients."""

@@ -6,20 +6,25 @@ import torch
 from torch import Tensor, nn
 
 from rpg.networks import mlp
+from rpg.policies.config import PolicyConfig
+from rpg.policies.heads import ActionDistribution, make_head
 from rpg.policies.latent import LatentSpace
-from rpg.policies.tanh_normal import TanhNormal
 
 
 class LatentPolicy(nn.Module):
-    """pi_theta(a|s, z): tanh-normal actions from a latent state and z.
+    """pi_theta(a|s, z): actions from a latent state and z.
 
     Args:
         state_dim: width of the world model's latent state s.
-        latent_dim: width of z; 0 makes it the single-mode policy of MBSAC.
+        latent_dim: width of z; 0 makes it a policy of the state alone, as MBSAC's.
         action_dim: number of action dimensions, each in (-1, 1).
         width: hidden width.
         base_std: see :class:`TanhNormal`.
         activation: see :data:`rpg.networks.ACTIVATIONS`.
+        config: which distribution; a tanh-normal by default.
+
+    Attributes:
+        noise_dim: standard normals behind one action.
     """
 
     def __init__(
@@ -30,14 +35,17 @@ class LatentPolicy(nn.Module):
         width: int,
         base_std: float,
         activation: str = "elu",
+        config: PolicyConfig | None = None,
     ) -> None:
         super().__init__()
-        self._base_std = base_std
-        self.net = mlp(state_dim + latent_dim, width, 2 * action_dim, activation)
+        self.head = make_head(config or PolicyConfig(), action_dim, width, base_std)
+        self.noise_dim = self.head.noise_dim
+        self.net = mlp(state_dim + latent_dim, width, self.head.params_dim, activation)
 
-    def forward(self, state: Tensor, latent: Tensor) -> TanhNormal:
+    def forward(self, state: Tensor, latent: Tensor) -> ActionDistribution:
         """Distribution over actions for (..., state_dim) and (..., latent_dim)."""
-        return TanhNormal(self.net(torch.cat([state, latent], dim=-1)), self._base_std)
+        distribution: ActionDistribution = self.head(self.net(torch.cat([state, latent], dim=-1)))
+        return distribution
 
 
 class LatentPosterior(nn.Module):

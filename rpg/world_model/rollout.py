@@ -34,8 +34,9 @@ def imagine(
     horizon: int,
     alpha: Tensor | None = None,
     noise: Tensor | None = None,
+    actions: Tensor | None = None,
 ) -> Imagined:
-    """Follow the policy inside the model.
+    """Follow the policy, or given actions, inside the model.
 
     Args:
         model: dynamics, reward and value.
@@ -44,18 +45,22 @@ def imagine(
         latent: (N, latent_dim), one z for the whole rollout.
         horizon: number of model steps H.
         alpha: weight of the entropy of the bootstrap's own action (critic ``q`` only); None leaves it out.
-        noise: (1, H, N, action_dim) standard normal, for critic ``q`` (2, H, N, action_dim) with the
+        noise: (1, H, N, noise_dim) standard normal, for critic ``q`` (2, H, N, noise_dim) with the
             bootstrap's own; None draws it.
+        actions: (H, N, action_dim), taken instead of the policy's, with a log-density of 0; None follows the policy.
     """
-    states, actions, log_pis, embeddeds = [state], [], [], []
+    states, taken, log_pis, embeddeds = [state], [], [], []
     dynamics = model.dynamics
     hidden = dynamics.start(state)
     for step in range(horizon):
-        action, log_pi = policy(states[-1], latent).rsample(None if noise is None else noise[0, step])
+        if actions is None:
+            action, log_pi = policy(states[-1], latent).rsample(None if noise is None else noise[0, step])
+        else:
+            action, log_pi = actions[step], torch.zeros_like(actions[step, :, 0])
         embedded = dynamics.embed(action)
         hidden = dynamics.step(hidden, embedded)
         states.append(dynamics.readout(hidden))
-        actions.append(action)
+        taken.append(action)
         log_pis.append(log_pi)
         embeddeds.append(embedded)
     stacked = torch.stack(states)
@@ -69,7 +74,7 @@ def imagine(
         if alpha is not None:
             bootstrap = bootstrap - alpha * log_pi
     rewards = model.reward(reached, torch.stack(embeddeds))
-    return Imagined(stacked, torch.stack(actions), torch.stack(log_pis), rewards, bootstrap)
+    return Imagined(stacked, torch.stack(taken), torch.stack(log_pis), rewards, bootstrap)
 
 
 def shaped_reward(

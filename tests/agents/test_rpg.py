@@ -12,7 +12,16 @@ import torch
 from gymnasium.spaces import Box
 from torch import Tensor
 
-from rpg.agents import RPG, EntropyDecay, LatentConfig, PriorConfig, RewardRamp, RPGConfig, WorldModelConfig
+from rpg.agents import (
+    RPG,
+    EntropyDecay,
+    LatentConfig,
+    PolicyConfig,
+    PriorConfig,
+    RewardRamp,
+    RPGConfig,
+    WorldModelConfig,
+)
 from rpg.agents.prior import LatentPrior
 from rpg.errors import RPGError
 from rpg.policies import make_latent_space
@@ -36,6 +45,14 @@ VARIANTS = {
     "learned prior": replace(TINY, latent=CATEGORIES, prior=PriorConfig(mode="policy_gradient", every=2)),
     "regressed prior": replace(TINY, latent=CATEGORIES, prior=PriorConfig(mode="regression", every=2)),
     "action values": replace(TINY, world_model=WorldModelConfig(state_dim=8, width=16, critic="q")),
+    "mixture": replace(TINY, policy=PolicyConfig("mixture", components=3)),
+    "mixture of action values": replace(
+        TINY,
+        policy=PolicyConfig("mixture", components=3),
+        world_model=WorldModelConfig(state_dim=8, width=16, critic="q"),
+    ),
+    "flow": replace(TINY, policy=PolicyConfig("flow")),
+    "search": replace(TINY, policy=PolicyConfig("cem")),
     "entropy in target": replace(TINY, entropy_in_target=True, actor_value="min", horizon_decay=0.0),
 }
 every_variant = pytest.mark.parametrize("config", VARIANTS.values(), ids=VARIANTS.keys())
