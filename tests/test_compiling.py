@@ -233,17 +233,21 @@ def test_a_region_that_cannot_be_compiled_runs_plainly_and_says_so() -> None:
     assert "unfit" in compiling.LOG.failed
 
 
-@needs_compiler
-@pytest.mark.timeout(900)
+def traced(function: Any) -> Any:
+    """As a region is traced, in one piece and with its gradients, but run by plain kernels: seconds, not a minute."""
+    compiling._load_compiler()
+    return torch.compile(function, fullgraph=True, dynamic=False, backend="aot_eager")
+
+
+@pytest.mark.timeout(600)
 @pytest.mark.parametrize("kind", ["mixture", "flow", "cem"])
-def test_every_kind_of_policy_compiles_to_what_it_is(kind: str) -> None:
+def test_every_kind_of_policy_can_be_traced_as_a_region(kind: str) -> None:
     search = CEMConfig(samples=8, elites=3, iterations=2, proposals=2)
     policy = PolicyConfig(kind, components=3, layers=2, cem=search)
     plain, compiled = (make_agent(dynamics="residual", policy=policy) for _ in range(2))
-    compiled._policy_region = compiling.compile_region(compiled._learn_policy, f"{kind} policy", CPU)
-    compiled._act_region = compiling.compile_region(compiled._act, f"{kind} act", CPU)
+    compiled._policy_region, compiled._act_region = traced(compiled._learn_policy), traced(compiled._act)
     if compiled._planner is not None:
-        compiled._planner.compile()
+        compiled._planner._region = traced(compiled._planner._search)
     rows = []
     for agent in (plain, compiled):
         agent.begin_episodes(
@@ -255,6 +259,5 @@ def test_every_kind_of_policy_compiles_to_what_it_is(kind: str) -> None:
             row |= agent.update(batch, env_steps=i)
             row["action"] = agent.act(batch.obs, batch.latent)
         rows.append(row | {"policy": agent._policy_optimizer.vector.detach()})
-    assert not [name for name in compiling.LOG.failed if name.startswith(kind)]
     for key, value in rows[0].items():
         torch.testing.assert_close(rows[1][key], value, rtol=2e-3, atol=2e-4, msg=key)
