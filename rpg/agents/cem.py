@@ -17,51 +17,13 @@ from torch import Tensor
 from rpg.agents.config import RPGConfig
 from rpg.compiling import compile_region
 from rpg.policies import LatentPolicy, LatentPosterior
-from rpg.policies.config import CEMConfig
 from rpg.world_model import WorldModel
 from rpg.world_model.rollout import horizon_weights, imagine, shaped_reward, value_estimate
-
-SequenceValue = Callable[[Tensor], Tensor]
-
-
-def cross_entropy_search(
-    config: CEMConfig, value: SequenceValue, proposals: Tensor, warm: Tensor, draws: Tensor, pick: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Refit independent normals over action sequences to the best of their samples, again and again.
-
-    Args:
-        config: sizes.
-        value: of sequences (H, n, M, action_dim), (n, M); higher is better.
-        proposals: (H, n, P, action_dim), considered in every iteration.
-        warm: (H, n, action_dim), where the search begins.
-        draws: (iterations, H, n, samples, action_dim), standard normal.
-        pick: (n,) in [0, 1], which of the last elites to take, by the distribution of their weights; 0 is the best.
-
-    Returns:
-        That elite's first action (n, action_dim), the std of first actions (n, action_dim) and the mean of all,
-        (H, n, action_dim).
-    """
-    mean, std = warm, torch.full_like(warm, config.initial_std)
-    elite, weight = proposals, pick
-    for draw in draws:
-        drawn = (mean.unsqueeze(2) + std.unsqueeze(2) * draw).clamp(-1.0, 1.0)
-        actions = torch.cat([drawn, proposals], dim=2)  # (H, n, M, action_dim)
-        best, index = value(actions).topk(config.elites, dim=1)
-        rows = index[None, :, :, None].expand(len(actions), -1, -1, actions.shape[-1])
-        elite = actions.gather(2, rows)
-        weight = (config.temperature * best).softmax(1)  # (n, elites)
-        share = weight[None, :, :, None]
-        refit = (share * elite).sum(2)
-        spread = (share * (elite - refit.unsqueeze(2)).square()).sum(2).sqrt()
-        mean = config.momentum * mean + (1.0 - config.momentum) * refit
-        std = spread.clamp(config.min_std, config.initial_std)
-    chosen = (weight.cumsum(1) < pick.unsqueeze(1)).sum(1).clamp(max=config.elites - 1)
-    first = elite[0].gather(1, chosen[:, None, None].expand(-1, 1, elite.shape[-1])).squeeze(1)
-    return first, std[0], mean
+from rpg.world_model.search import cross_entropy_search
 
 
 class CEMPlanner:
-    """Chooses an agent's actions by :func:`cross_entropy_search` on Eq. 3.3.
+    """Chooses an agent's actions by :func:`rpg.world_model.search.cross_entropy_search` on Eq. 3.3.
 
     A sequence is worth its predicted rewards, the consistency of z and the first value head's bootstrap, averaged
     over horizons as for the policy; actions that are given have no entropy.
@@ -158,7 +120,10 @@ class CEMPlanner:
         def value(actions: Tensor) -> Tensor:
             return self._value(state, latent, actions)
 
-        first, std, mean = cross_entropy_search(self._cem, value, proposals, warm, draws, pick)
+        cem = self._cem
+        first, std, mean = cross_entropy_search(
+            cem, value, proposals, warm, draws, pick, cem.initial_std, cem.min_std
+        )
         return (first + std * noise).clamp(-1.0, 1.0), mean
 
     def _value(self, state: Tensor, latent: Tensor, actions: Tensor) -> Tensor:

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from rpg.errors import RPGError
+from rpg.world_model.search import cross_entropy_search
 
 _FIRST_STD = 2.0  # of every search, and its largest
 
@@ -81,7 +82,7 @@ class PlanNoise(NamedTuple):
     """All random numbers of a search for n environments, standard normal but for ``choice``.
 
     Attributes:
-        samples: (iterations, n, H, samples, action_dim).
+        samples: (iterations, H, n, samples, action_dim).
         proposals: (H, n, proposals, action_dim).
         choice: (n,) uniform in [0, 1): which elite acts; 0 for the best.
         action: (n, action_dim) on top of its first action; 0 for none.
@@ -97,7 +98,7 @@ class PlanNoise(NamedTuple):
         cls, config: PlannerConfig, n: int, horizon: int, action_dim: int, device: torch.device, greedy: bool
     ) -> PlanNoise:
         """Fresh numbers; ``greedy`` lets the best elite act, without noise on top."""
-        samples = torch.randn(config.iterations, n, horizon, config.samples, action_dim, device=device)
+        samples = torch.randn(config.iterations, horizon, n, config.samples, action_dim, device=device)
         proposals = torch.randn(horizon, n, config.proposals, action_dim, device=device)
         if greedy:
             still = torch.zeros(n, action_dim, device=device)
@@ -135,41 +136,30 @@ def plan(
     Returns:
         Actions (n, action_dim) in [-1, 1], and the mean (n, H, action_dim) that the search ended with.
     """
-    n, steps, _ = mean.shape
-    used = torch.arange(steps, device=mean.device) < horizon  # (H,)
-    mean = mean * used.unsqueeze(1)
-    std = torch.full_like(mean, _FIRST_STD)
+    used = torch.arange(mean.shape[1], device=mean.device) < horizon  # (H,)
+    warm = (mean * used.unsqueeze(1)).transpose(0, 1)  # (H, n, action_dim)
     proposed = _propose(model, policy, state, noise.proposals * config.min_std)
     start = state.unsqueeze(1).expand(-1, config.samples + config.proposals, -1)
-    for drawn in noise.samples:
-        sampled = (mean.unsqueeze(2) + std.unsqueeze(2) * drawn).clamp(-1.0, 1.0)  # (n, H, samples, A)
-        actions = torch.cat([sampled, proposed], dim=2)
-        value = _value(model, policy, start, actions, used, gamma)  # (n, samples + proposals)
-        best = value.topk(config.elites, dim=1)
-        rows = best.indices[:, None, :, None].expand(-1, steps, -1, mean.shape[2])
-        elite = actions.gather(2, rows)  # (n, H, elites, A), best first
-        score = (config.temperature * best.values).softmax(1)  # (n, elites)
-        weight = score[:, None, :, None]
-        fitted = (weight * elite).sum(2)
-        spread = (weight * (elite - fitted.unsqueeze(2)).square()).sum(2).sqrt()
-        std = torch.maximum(spread, min_std).clamp(max=_FIRST_STD)
-        mean = config.momentum * mean + (1.0 - config.momentum) * fitted
-    # By inverting the cumulated scores: as many elites are passed over as lie below the drawn number.
-    chosen = (score.cumsum(1) < noise.choice.unsqueeze(1)).sum(1).clamp(max=config.elites - 1)
-    first = elite[torch.arange(n, device=mean.device), 0, chosen]
-    action = (first + std[:, 0] * noise.action).clamp(-1.0, 1.0)
-    return action, mean * used.unsqueeze(1)
+
+    def value(actions: Tensor) -> Tensor:
+        return _value(model, policy, start, actions, used, gamma)
+
+    first, std, fitted = cross_entropy_search(
+        config, value, proposed, warm, noise.samples, noise.choice, _FIRST_STD, min_std
+    )
+    action = (first + std * noise.action).clamp(-1.0, 1.0)
+    return action, fitted.transpose(0, 1) * used.unsqueeze(1)
 
 
 def _propose(model: PlannedModel, policy: ProposingPolicy, state: Tensor, noise: Tensor) -> Tensor:
-    """Follow the policy from every state: (n, H, proposals, action_dim) for noise (H, n, proposals, action_dim)."""
+    """Follow the policy from every state: actions (H, n, proposals, action_dim) for noise of that shape."""
     state = state.unsqueeze(1).expand(-1, noise.shape[2], -1)
     actions = []
     for step_noise in noise:
         action = policy.sample(state, step_noise)
         state, _ = model.step(state, action)
         actions.append(action)
-    return torch.stack(actions, dim=1)
+    return torch.stack(actions)
 
 
 def _value(
@@ -180,14 +170,14 @@ def _value(
     used: Tensor,
     gamma: float,
 ) -> Tensor:
-    """sum_{t<h} gamma^t r_t + gamma^h min_i Q_i(s_h, pi(s_h)), (n, m), of actions (n, H, m, action_dim).
+    """sum_{t<h} gamma^t r_t + gamma^h min_i Q_i(s_h, pi(s_h)), (n, m), of actions (H, n, m, action_dim).
 
     ``used`` (H,) is True for the first h steps. What is not finite counts as the worst value there is.
     """
     total = torch.zeros_like(state[..., 0])
     discount = torch.ones((), device=state.device)
-    for step, counts in enumerate(used):
-        after, reward = model.step(state, actions[:, step])
+    for chosen, counts in zip(actions, used, strict=True):
+        after, reward = model.step(state, chosen)
         total = total + torch.where(counts, discount * reward, 0.0)
         state = torch.where(counts, after, state)
         discount = torch.where(counts, gamma * discount, discount)

@@ -12,11 +12,11 @@ import torch
 from torch import Tensor
 
 from rpg.agents import RPG, CEMConfig, LatentConfig, PolicyConfig, RPGConfig, WorldModelConfig
-from rpg.agents.cem import cross_entropy_search
 from rpg.envs.bandit import bandit_reward
 from rpg.errors import RPGError
 from rpg.training.build import parse_config
 from rpg.world_model.rollout import imagine
+from rpg.world_model.search import cross_entropy_search
 
 N = 100
 
@@ -41,7 +41,14 @@ def search(
     held = torch.zeros(horizon, N, 0, 1) if proposals is None else proposals
     pick = torch.zeros(N) if best else torch.rand(N)
     first, std, mean = cross_entropy_search(
-        config, value, held, torch.full((horizon, N, 1), warm), draws, pick
+        config,
+        value,
+        held,
+        torch.full((horizon, N, 1), warm),
+        draws,
+        pick,
+        config.initial_std,
+        config.min_std,
     )
     return first[:, 0], std[:, 0], mean[..., 0]
 
