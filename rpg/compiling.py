@@ -88,7 +88,13 @@ def compile_region(function: Callable[P, R], name: str, device: torch.device) ->
         "guard_filter_fn": torch.compiler.keep_tensor_guards_unsafe,
         "triton.cudagraphs": device.type == "cuda",
     }
-    compiled: Callable[P, R] = torch.compile(function, fullgraph=True, dynamic=False, options=options)
+
+    def own(*args: P.args, **kwargs: P.kwargs) -> R:
+        return function(*args, **kwargs)
+
+    # Compiled code is looked up by code object, and so would be that of an agent before with other settings.
+    own.__code__ = own.__code__.replace()
+    compiled: Callable[P, R] = torch.compile(own, fullgraph=True, dynamic=False, options=options)
     chosen: list[Callable[P, R]] = []
 
     def region(*args: P.args, **kwargs: P.kwargs) -> R:

@@ -211,6 +211,25 @@ def test_baselines_compiled_and_plain_learn_the_same_and_nothing_compiles_twice(
 
 @needs_compiler
 @pytest.mark.timeout(600)
+def test_each_region_has_its_own_settings() -> None:
+    """A sweep in one process makes agents that differ in numbers alone."""
+
+    class Scaled:
+        def __init__(self, factor: float) -> None:
+            self.factor = factor
+
+        def times(self, x: torch.Tensor) -> torch.Tensor:
+            return self.factor * x
+
+    regions = [compiling.compile_region(Scaled(factor).times, "times", CPU) for factor in (2.0, 3.0)]
+    x = torch.ones(4)
+    assert [float(region(x)[0]) for region in regions] == [2.0, 3.0]
+    with torch.compiler.set_stance("fail_on_recompile"):
+        assert [float(region(x)[0]) for region in regions] == [2.0, 3.0]
+
+
+@needs_compiler
+@pytest.mark.timeout(600)
 def test_compile_time_is_recorded() -> None:
     compiling.LOG.seconds.clear()
     density = make_density()
