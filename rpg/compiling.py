@@ -22,6 +22,11 @@ R = TypeVar("R")
 _CACHE = "TORCHINDUCTOR_CACHE_DIR"
 
 
+def _cache() -> str:
+    """Where artefacts are kept."""
+    return os.environ.get(_CACHE) or str(Path.home() / ".cache" / "rpg" / "compiled")
+
+
 class CompileLog:
     """How long the regions of this process took to compile.
 
@@ -41,7 +46,7 @@ class CompileLog:
         if not new:
             return ""
         names, spent = ", ".join(name for name, _ in new), sum(seconds for _, seconds in new)
-        return f"compiled {names} in {spent:.0f} s; kept in {os.environ[_CACHE]} for the next time"
+        return f"compiled {names} in {spent:.0f} s; kept in {_cache()} for the next time"
 
 
 LOG = CompileLog()
@@ -64,7 +69,7 @@ def compiler_missing(device: torch.device) -> str | None:
 
 
 def _load_compiler() -> None:
-    os.environ.setdefault(_CACHE, str(Path.home() / ".cache" / "rpg" / "compiled"))
+    os.environ[_CACHE] = _cache()
     import torch._dynamo  # takes a second, and settles where artefacts go
 
     torch._dynamo.config.trace_autograd_ops = True  # autograd.grad inside a region
