@@ -54,7 +54,7 @@ PANELS: dict[str, tuple[str, dict[str, str]]] = {
         "gaussian12": "RPG", "no_latent": "Gaussian", "mixture": "mixture", "flow": "flow", "cem": "CEM",
     }),
 }  # fmt: skip
-"""By letter: title, and the label of every variant (a file of `rpg/conf/variant`)."""
+"""By letter: title, and the label of every variant (a file of `rpg/conf/ablation`)."""
 
 NOT_PUBLISHED = ("no_rnd_buffer", "no_rnd_encoding", "no_policy_encoding")
 VARIANTS = {
@@ -67,7 +67,7 @@ VARIANTS = {
 
 def job(variant: str, seed: int, steps: int) -> Job:
     """One run of a variant."""
-    overrides = ("experiment=fig3_13", f"variant={variant}", f"seed={seed}", f"trainer.steps={steps}")
+    overrides = ("experiment=fig3_13", f"ablation={variant}", f"seed={seed}", f"trainer.steps={steps}")
     return Job(f"{variant} seed {seed}", _RUNS / variant / f"seed{seed}", overrides)
 
 

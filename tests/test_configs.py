@@ -25,7 +25,7 @@ AGENTS = sorted(p.stem for p in (CONF / "agent").glob("*.yaml"))
 OPTIONS = sorted(
     (p.parent.name, p.stem)
     for p in CONF.glob("*/*.yaml")
-    if p.parent.name not in ("agent", "variant") and not p.stem.startswith("fig3_13")
+    if p.parent.name not in ("agent", "ablation") and not p.stem.startswith("fig3_13")
 )
 # What tells from a log row that an agent learned.
 LEARNERS = {

@@ -21,7 +21,7 @@ from rpg.training.build import parse_config
 
 ROOT = Path(__file__).parents[1]
 CONF = Path(rpg.conf.__file__).parent
-FILES = sorted(path.stem for path in (CONF / "variant").glob("*.yaml"))
+FILES = sorted(path.stem for path in (CONF / "ablation").glob("*.yaml"))
 PRESETS = sorted(path.stem for path in (CONF / "experiment").glob("fig3_13_*.yaml"))
 
 Composed = Callable[..., DictConfig]
@@ -45,7 +45,7 @@ def settings(composed: Composed, variant: str) -> dict[str, Any]:
             return {prefix: tree}
         return {k: v for key, sub in tree.items() for k, v in flat(sub, f"{prefix}.{key}").items()}
 
-    return flat(OmegaConf.to_container(composed("experiment=fig3_13", f"variant={variant}"), resolve=True))
+    return flat(OmegaConf.to_container(composed("experiment=fig3_13", f"ablation={variant}"), resolve=True))
 
 
 CHANGES = {
@@ -88,7 +88,7 @@ def test_a_preset_sweeps_over_the_variants_of_its_panel(preset: str, script: dic
 
 
 def test_a_preset_brings_three_seeds_and_what_is_typed_replaces_its_variants() -> None:
-    typed = planned_runs(["-m", "experiment=fig3_13_a", "variant=no_latent", "trainer.steps=7"])
+    typed = planned_runs(["-m", "experiment=fig3_13_a", "ablation=no_latent", "trainer.steps=7"])
     assert typed == [(Path(f"runs/fig3_13/no_latent/seed{seed}"), 7) for seed in range(3)]
 
 
@@ -105,10 +105,10 @@ def test_every_preset_trains_under_debug(composed: Composed, preset: str) -> Non
         "trainer.eval_every=0",
     ]
     check_overrides([f"experiment=[{preset},debug]"])
-    own = OmegaConf.load(CONF / "experiment" / f"{preset}.yaml").hydra.sweeper.params.variant  # type: ignore[union-attr]
+    own = OmegaConf.load(CONF / "experiment" / f"{preset}.yaml").hydra.sweeper.params.ablation  # type: ignore[union-attr]
     for variant in own.split(",")[1:]:  # the first is that of every panel
         name = f"experiment=[{preset},debug]"
-        row = train(composed(name, f"variant={variant}", "size.rnd_batch_size=16", *quick, f"seed={len(variant)}",
+        row = train(composed(name, f"ablation={variant}", "size.rnd_batch_size=16", *quick, f"seed={len(variant)}",
                              f"run_dir={composed().run_dir}_{variant}"))  # fmt: skip
         assert row["env_steps"] == 60
         assert row["updates"] > 0
@@ -116,10 +116,10 @@ def test_every_preset_trains_under_debug(composed: Composed, preset: str) -> Non
 
 
 @pytest.mark.parametrize(("overrides", "told"), [
-    (["variant=beta0"], "did you mean 'beta_0"),
-    (["variant=gmm"], "known: "),
+    (["ablation=beta0"], "did you mean 'beta_0"),
+    (["ablation=gmm"], "known: "),
     (["experiment=[fig3_13_a,debgu]"], "did you mean 'debug'"),
-    (["variant=mixture", "agent.policy.components=0"], "components=0"),
+    (["ablation=mixture", "agent.policy.components=0"], "components=0"),
 ])  # fmt: skip
 def test_wrong_choices_are_refused_in_one_line(composed: Composed, overrides: list[str], told: str) -> None:
     with pytest.raises(RPGError) as caught:
@@ -151,7 +151,7 @@ def test_list_has_every_run_once_with_its_command(
     assert script["main"](["list"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 45  # the 15 published variants, 3 seeds
-    assert sum("variant=gaussian12 " in line for line in lines) == 3
+    assert sum("ablation=gaussian12 " in line for line in lines) == 3
     assert [line for line in lines if "trainer.steps=240000" not in line] == []
     assert "ABCDE" in lines[0]
 
