@@ -28,6 +28,7 @@ from growing_table import Table
 from plasticine_table import COLUMNS, CURVES, KEY, OUT
 from side_by_side import Job, run_side_by_side
 
+from rpg.cli import report_errors
 from rpg.envs.plasticine import PlasticineEnv
 from rpg.errors import RPGError, require_extra
 from rpg.provenance import provenance
@@ -180,17 +181,14 @@ def main(argv: list[str] | None = None) -> int:
         command.add_argument("--task", default="move")
         command.add_argument("--variant", type=int, default=1)
         command.add_argument("--episodes", type=int, default=1000)
-    args = parser.parse_args(argv)
-    try:
+    with report_errors():
+        args = parser.parse_args(argv)
         if args.command == "run":
             return run(args)
         if args.command == "learn":
             learn(args)
         else:
             print(gather())
-    except RPGError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
     return 0
 
 
