@@ -13,6 +13,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from rpg.compiling import keep_address
+
 
 class FlatParameters:
     """The parameters of ``module`` in one vector; the module keeps seeing them, as views.
@@ -92,6 +94,14 @@ class FlatAdam(FlatParameters):
         """Continue from :meth:`state_dict`."""
         for name in ("mean", "square", "count"):
             getattr(self, name).copy_(state[name])
+
+
+def keep_in_place(*flats: FlatParameters) -> None:
+    """Tell the compiler that these are updated in place and never replaced."""
+    for flat in flats:
+        keep_address(flat.vector)
+        if isinstance(flat, FlatAdam):
+            keep_address(flat.mean, flat.square, flat.count)
 
 
 class FlatGroup:

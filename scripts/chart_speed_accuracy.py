@@ -17,7 +17,6 @@ from __future__ import annotations
 import argparse
 import csv
 import json
-import sys
 import tempfile
 from collections import defaultdict
 from collections.abc import Iterable
@@ -30,6 +29,7 @@ from omegaconf import OmegaConf
 from side_by_side import Job, run_side_by_side, write_table
 
 from rpg import pareto
+from rpg.cli import report_errors
 from rpg.conf import compose_config
 from rpg.errors import RPGError, nearest
 from rpg.plot import Run, aggregate, group_runs, load_run
@@ -255,7 +255,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--jobs", type=int, default=2, help="runs side by side")
     parser.add_argument("--seeds", type=int, nargs="*", help="default: 0, and 0 1 2 for the front")
     args = parser.parse_args(argv)
-    try:
+    with report_errors():
         if args.action == "run":
             return run(args.configs, args.jobs, args.seeds)
         if args.action == "gather":
@@ -265,9 +265,6 @@ def main(argv: list[str] | None = None) -> int:
         else:
             for config in configs().values():
                 print(f"{config.name:26} {' '.join(config.overrides)}".rstrip())
-    except RPGError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
     return 0
 
 

@@ -25,6 +25,7 @@ import torch
 from growing_table import Table
 from side_by_side import Job, run_side_by_side
 
+from rpg.cli import report_errors
 from rpg.errors import RPGError
 from rpg.provenance import provenance
 from rpg.sweep import OUTCOME
@@ -164,7 +165,7 @@ def main(argv: list[str] | None = None) -> int:
     for command in (runs, one):
         command.add_argument("--steps", type=int, default=20_000, help=f"a multiple of {EVERY}")
     args = parser.parse_args(argv)
-    try:
+    with report_errors():
         if args.command == "gather":
             print(gather())
         elif args.steps < EVERY or args.steps % EVERY:
@@ -173,9 +174,6 @@ def main(argv: list[str] | None = None) -> int:
             return run_side_by_side(jobs_of(args.implementations, args.seeds, args.steps), args.jobs)
         else:
             learn(args.seed, args.steps, args.folder)
-    except RPGError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
     return 0
 
 

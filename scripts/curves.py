@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import csv
 import json
-import sys
 from collections import defaultdict
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,7 @@ from typing import Any
 from omegaconf import OmegaConf
 from side_by_side import Job, run_side_by_side, write_table
 
+from rpg.cli import report_errors
 from rpg.errors import RPGError
 from rpg.figures import curve, legend, new_figure, save, style_axes
 from rpg.training.loggers import Row, read_rows
@@ -133,13 +133,10 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--window", type=int, default=10, help="log rows that a drawn point is the mean of")
     args = parser.parse_args(argv)
-    try:
+    with report_errors():
         if args.action == "run":
             return run_side_by_side(jobs_of(args), args.jobs)
         print(gather(args.task) if args.action == "gather" else draw(args.task, args.window))
-    except RPGError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
     return 0
 
 

@@ -10,12 +10,12 @@ from __future__ import annotations
 
 import argparse
 import csv
-import sys
 from collections import defaultdict
 from pathlib import Path
 
 import numpy as np
 
+from rpg.cli import report_errors
 from rpg.errors import RPGError
 from rpg.figures import curve, legend, new_figure, save, style_axes
 
@@ -79,11 +79,8 @@ def draw() -> Path:
 def main(argv: list[str] | None = None) -> int:
     """Console entry."""
     argparse.ArgumentParser(description="Fig. 2.4.").parse_args(argv)
-    try:
+    with report_errors():
         print(draw())
-    except RPGError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
     return 0
 
 

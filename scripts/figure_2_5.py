@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import csv
 import json
-import sys
 from collections import defaultdict
 from pathlib import Path
 
@@ -21,6 +20,7 @@ from growing_table import Table
 from plasticine_table import SolveJob
 from side_by_side import Job, run_side_by_side
 
+from rpg.cli import report_errors
 from rpg.errors import RPGError
 from rpg.figures import curve, legend, new_figure, save, style_axes
 
@@ -110,13 +110,10 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--jobs", type=int, default=1, help="runs side by side")
     parser.add_argument("--threads", type=int, default=1)
     args = parser.parse_args(argv)
-    try:
+    with report_errors():
         if args.action == "run":
             return run_side_by_side(jobs_of(args), args.jobs)
         print(gather() if args.action == "gather" else draw())
-    except RPGError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
     return 0
 
 

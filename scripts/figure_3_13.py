@@ -17,7 +17,6 @@ from __future__ import annotations
 import argparse
 import csv
 import json
-import sys
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
@@ -26,6 +25,7 @@ from typing import Any
 import numpy as np
 from side_by_side import Job, run_side_by_side, write_table
 
+from rpg.cli import report_errors
 from rpg.errors import RPGError
 from rpg.figures import curve, new_figure, save, short_count, steps_axis, style_axes
 from rpg.stats import iqm, stratified_bootstrap
@@ -219,7 +219,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--jobs", type=int, default=2, help="runs side by side")
     args = parser.parse_args(argv)
     names = args.variants or [name for name in VARIANTS if name not in NOT_PUBLISHED]
-    try:
+    with report_errors():
         steps, seeds = within_budget(1.0 if args.budget is None else args.budget)
         jobs = planned(names, args.steps or steps, args.seeds or seeds)
         if args.action == "list":
@@ -230,9 +230,6 @@ def main(argv: list[str] | None = None) -> int:
             return run_side_by_side(jobs, args.jobs)
         else:
             print(gather() if args.action == "gather" else draw())
-    except RPGError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
     return 0
 
 

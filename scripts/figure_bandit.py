@@ -34,6 +34,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from rpg.bandit import BanditConfig, BanditResult, TanhNormalMixture, train_gaussian, train_rpg
+from rpg.cli import report_errors
 from rpg.envs.bandit import GLOBAL_HALF_WIDTH, GLOBAL_PEAK, bandit_reward
 from rpg.errors import RPGError
 
@@ -66,13 +67,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         "--study", action="store_true", help="also train the variants listed in docs/bandit.md"
     )
     args = parser.parse_args(argv)
-    try:
+    with report_errors():
         if not args.redraw:
             run(args)
         draw(args.out)
-    except RPGError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
     return 0
 
 

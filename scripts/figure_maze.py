@@ -17,6 +17,7 @@ import numpy as np
 from matplotlib.collections import LineCollection
 from matplotlib.colors import LogNorm
 
+from rpg.cli import report_errors
 from rpg.envs.layouts import LAYOUTS
 from rpg.errors import RPGError
 from rpg.figures import curve, legend, new_figure, save, steps_axis, style_axes
@@ -148,13 +149,10 @@ def main() -> int:
     parser.add_argument("action", choices=["gather", "draw"])
     parser.add_argument("--seed", type=int, default=0, help="which seed's states to show")
     args = parser.parse_args()
-    try:
+    with report_errors():
         if args.action == "gather":
             gather(args.seed)
         draw()
-    except RPGError as error:
-        print(f"error: {error}")
-        return 2
     return 0
 
 

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,6 +19,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from rpg.cli import report_errors
 from rpg.envs.plasticine_registration import TASKS
 from rpg.errors import RPGError
 from rpg.figures import new_figure, save
@@ -93,7 +93,7 @@ def main(argv: list[str] | None = None) -> int:
     args = parser.parse_args(argv)
     tasks = args.tasks or list(TASKS.values())
     pictures, titles = [], []
-    try:
+    with report_errors():
         for task in tasks:
             scene = load_scene(task, variant=args.variant)
             solution = best_solution(args.runs, scene)
@@ -102,9 +102,6 @@ def main(argv: list[str] | None = None) -> int:
             score = None if solution is None else solution.score
             titles.append(scene.name if score is None else f"{scene.name}: {score:.2f}")
             print(f"{scene.name}: {'no solution' if solution is None else solution.folder}")
-    except RPGError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
     rows = [i for i in range(len(_ROWS)) if any(column[i] is not None for column in pictures)]
     fig, axes = new_figure(len(rows), len(tasks), width=1.5, height=1.6)
     for k, ax in enumerate(axes):

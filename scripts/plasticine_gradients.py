@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import argparse
 import statistics
-import sys
 from collections import defaultdict
 from collections.abc import Callable
 from pathlib import Path
@@ -30,6 +29,7 @@ from plasticine_motion import pressing_actions
 from side_by_side import write_table
 from torch import Tensor
 
+from rpg.cli import report_errors
 from rpg.errors import RPGError, nearest
 from rpg.plasticine.scene import Scene, load_scene
 from rpg.plasticine.scenes import scene_names
@@ -283,13 +283,10 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--particles", type=int, help="default: those of the task")
     parser.add_argument("--threads", type=int, default=2)
     args = parser.parse_args(argv)
-    try:
+    with report_errors():
         if args.action == "run":
             run(args)
         print(summary())
-    except RPGError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
     return 0
 
 

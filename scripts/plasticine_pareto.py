@@ -18,7 +18,6 @@ from __future__ import annotations
 import argparse
 import csv
 import statistics
-import sys
 import time
 from collections import defaultdict
 from collections.abc import Sequence
@@ -32,6 +31,7 @@ from matplotlib.axes import Axes
 from plasticine_motion import pressing_actions
 from torch import Tensor
 
+from rpg.cli import report_errors
 from rpg.errors import RPGError, nearest
 from rpg.figures import INK, color, legend, new_figure, save, style_axes
 from rpg.plasticine.scene import Scene, load_scene
@@ -266,7 +266,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--score", type=int, default=0, help="iterations of the solver; 0: none")
     parser.add_argument("--again", action="store_true", help="measure also what the table has")
     args = parser.parse_args(argv)
-    try:
+    with report_errors():
         if args.action == "run":
             run(args)
         elif args.action == "draw":
@@ -274,9 +274,6 @@ def main(argv: list[str] | None = None) -> int:
         else:
             for config in CONFIGS.values():
                 print(f"{config.name:24} {' '.join(f'{k}={v}' for k, v in config.settings.items())}".rstrip())
-    except RPGError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
     return 0
 
 

@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import argparse
 import csv
-import sys
 import time
 from collections import defaultdict
 from dataclasses import dataclass
@@ -31,6 +30,7 @@ from growing_table import Table
 from matplotlib.ticker import NullLocator
 from torch import Tensor
 
+from rpg.cli import report_errors
 from rpg.errors import RPGError
 from rpg.figures import curve, legend, new_figure, save, style_axes
 from rpg.plasticine.scene import Scene, load_scene
@@ -187,13 +187,10 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("action", choices=["run", "draw"])
     parser.add_argument("--threads", type=int, default=2)
     args = parser.parse_args(argv)
-    try:
+    with report_errors():
         if args.action == "run":
             run(args.threads)
         print(draw())
-    except RPGError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
     return 0
 
 

@@ -30,7 +30,7 @@ from side_by_side import Job, run_side_by_side
 
 from rpg.cli import report_errors
 from rpg.envs.plasticine import PlasticineEnv
-from rpg.errors import RPGError, require_extra
+from rpg.errors import RPGError
 from rpg.provenance import provenance
 from rpg.training.loggers import write_atomic
 
@@ -97,7 +97,6 @@ def make_agent(method: str, env: gymnasium.Env[Any, Any], seed: int) -> Any:
 
 def learn(args: argparse.Namespace) -> None:
     """Train one agent, judge it, and write its curve and result."""
-    require_extra("numba", "plasticine", "plasticine")
     torch.set_num_threads(1)
     folder: Path = args.folder
     folder.mkdir(parents=True, exist_ok=True)

@@ -24,6 +24,7 @@ import figure_2_4
 from growing_table import Table
 from side_by_side import Job, run_side_by_side
 
+from rpg.cli import report_errors
 from rpg.errors import RPGError, nearest
 from rpg.plasticine.scenes import scene_names
 from rpg.plasticine.solver import METHODS
@@ -120,13 +121,10 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--jobs", type=int, default=1, help="runs side by side")
     parser.add_argument("--threads", type=int, default=1)
     args = parser.parse_args(argv)
-    try:
+    with report_errors():
         if args.action == "run":
             return run_side_by_side(jobs_of(args), args.jobs)
         print(gather() if args.action == "gather" else figure_2_4.draw())
-    except RPGError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
     return 0
 
 

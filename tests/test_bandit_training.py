@@ -152,5 +152,6 @@ def test_script_writes_and_redraws_the_figure(tmp_path: Path, capsys: pytest.Cap
     (tmp_path / "figure_3_4.png").unlink()
     assert script.main(["--redraw", "--out", str(tmp_path)]) == 0
     assert (tmp_path / "figure_3_4.png").read_bytes() == picture
-    assert script.main(["--redraw", "--out", str(tmp_path / "nowhere")]) == 2
+    with pytest.raises(SystemExit, match="2"):
+        script.main(["--redraw", "--out", str(tmp_path / "nowhere")])
     assert "policy.csv is missing; run the script without --redraw first" in capsys.readouterr().err

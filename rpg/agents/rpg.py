@@ -16,9 +16,9 @@ from rpg.agents.config import RPGConfig
 from rpg.agents.networks import Auxiliary
 from rpg.agents.noise import ActionNoise
 from rpg.agents.prior import LatentPrior
-from rpg.compiling import compile_region, keep_address
+from rpg.compiling import compile_region
 from rpg.exploration.objects import ObjectsOfInterest
-from rpg.flat import FlatAdam, FlatGroup, FlatParameters
+from rpg.flat import FlatAdam, FlatGroup, FlatParameters, keep_in_place
 from rpg.pixels import FrameShape
 from rpg.policies import LatentPolicy, LatentPosterior, make_latent_space
 from rpg.segments import SegmentBatch
@@ -98,9 +98,7 @@ class RPG(Agent):
 
     def compile(self) -> None:
         """Compile the learning step and acting; results are those of the plain functions up to rounding."""
-        for flat in (self._model_optimizer, self._policy_optimizer, self._aux_optimizer):
-            keep_address(flat.vector, flat.mean, flat.square, flat.count)
-        keep_address(self._target_vector.vector)
+        keep_in_place(self._model_optimizer, self._policy_optimizer, self._aux_optimizer, self._target_vector)
         self._model_region = compile_region(self._learn_model, "world model", self.device)
         self._policy_region = compile_region(self._learn_policy, "policy", self.device)
         self._act_region = compile_region(self._act, "act", self.device)

@@ -12,10 +12,10 @@ from torch import Tensor, nn
 
 from rpg.agents.agent import Agent, Metrics
 from rpg.agents.config import LearnerConfig, RewardRamp
-from rpg.compiling import compile_region, keep_address
+from rpg.compiling import compile_region
 from rpg.errors import RPGError
 from rpg.exploration.objects import ObjectsOfInterest
-from rpg.flat import FlatAdam, FlatGroup, FlatParameters
+from rpg.flat import FlatAdam, FlatGroup, FlatParameters, keep_in_place
 from rpg.networks import ACTIVATIONS, TwinMLP
 from rpg.policies import LatentPolicy
 from rpg.segments import SegmentBatch
@@ -146,9 +146,9 @@ class SAC(Agent):
 
     def compile(self) -> None:
         """Compile the learning step and acting; results are those of the plain functions up to rounding."""
-        for flat in (self._policy_optimizer, self._critic_optimizer, self._alpha_optimizer):
-            keep_address(flat.vector, flat.mean, flat.square, flat.count)
-        keep_address(self._target_vector.vector)
+        keep_in_place(
+            self._policy_optimizer, self._critic_optimizer, self._alpha_optimizer, self._target_vector
+        )
         self._critic_region = compile_region(self._learn_critic, "critic", self.device)
         self._policy_region = compile_region(self._learn_policy, "policy", self.device)
         self._act_region = compile_region(self._act, "act", self.device)

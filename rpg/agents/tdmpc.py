@@ -12,10 +12,10 @@ from torch import Tensor, nn
 
 from rpg.agents.agent import Agent, Metrics
 from rpg.agents.config import LearnerConfig, RewardRamp
-from rpg.compiling import compile_region, keep_address
+from rpg.compiling import compile_region
 from rpg.errors import RPGError
 from rpg.exploration.objects import ObjectsOfInterest
-from rpg.flat import FlatAdam, FlatGroup, FlatParameters
+from rpg.flat import FlatAdam, FlatGroup, FlatParameters, keep_in_place
 from rpg.networks import ACTIVATIONS
 from rpg.pixels import FrameShape
 from rpg.policies.noisy import NoisyPolicy
@@ -178,9 +178,7 @@ class TDMPC(Agent):
 
     def compile(self) -> None:
         """Compile the learning step and the planner; results are those of the plain functions up to rounding."""
-        for flat in (self._model_optimizer, self._policy_optimizer):
-            keep_address(flat.vector, flat.mean, flat.square, flat.count)
-        keep_address(self._target_vector.vector)
+        keep_in_place(self._model_optimizer, self._policy_optimizer, self._target_vector)
         self._model_region = compile_region(self._learn_model, "world model", self.device)
         self._policy_region = compile_region(self._learn_policy, "policy", self.device)
         self._plan_region = compile_region(self._plan, "plan", self.device)

@@ -15,6 +15,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 from torch import Tensor
 
+from rpg.envs.checks import checked_reset_mask
 from rpg.envs.single import SingleEnv
 from rpg.errors import NonFiniteError, RPGError
 
@@ -76,17 +77,7 @@ class BanditVectorEnv(VectorEnv[Array, Array, Array]):
 
         Seeds are accepted as in ``SyncVectorEnv`` and change nothing.
         """
-        if seed is not None and not isinstance(seed, int) and len(seed) != self.num_envs:
-            raise RPGError(
-                f"bandit reset: {len(seed)} seeds for {self.num_envs} environments; give one for each"
-            )
-        mask = None if options is None else options.get("reset_mask")
-        if mask is None:
-            mask = np.ones(self.num_envs, dtype=np.bool_)
-        if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_ or mask.shape != (self.num_envs,):
-            raise RPGError(
-                f"bandit reset: reset_mask {mask!r} must be a bool array of shape ({self.num_envs},)"
-            )
+        mask = checked_reset_mask("bandit", self.num_envs, seed, options)
         self._finished[mask] = False
         return self._observations(), {}
 

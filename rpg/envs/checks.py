@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,31 @@ def checked_render_mode(name: str, render_mode: str | None) -> str | None:
     if render_mode not in (None, "rgb_array"):
         raise RPGError(f"{name}: render_mode '{render_mode}' is unknown; use 'rgb_array' or None")
     return render_mode
+
+
+def checked_reset_mask(
+    name: str, num_envs: int, seed: int | Sequence[int | None] | None, options: dict[str, Any] | None
+) -> NDArray[np.bool_]:
+    """Which of ``num_envs`` environments a ``reset`` is to begin anew: all, or ``options["reset_mask"]``.
+
+    Raises:
+        RPGError: a mask that is none, or that is False everywhere; another number of seeds.
+    """
+    if seed is not None and not isinstance(seed, int) and len(seed) != num_envs:
+        raise RPGError(f"{name} reset: {len(seed)} seeds for {num_envs} environments; give one for each")
+    mask = None if options is None else options.get("reset_mask")
+    if mask is None:
+        return np.ones(num_envs, dtype=np.bool_)
+    if (
+        not isinstance(mask, np.ndarray)
+        or mask.dtype != np.bool_
+        or mask.shape != (num_envs,)
+        or not mask.any()
+    ):
+        raise RPGError(
+            f"{name} reset: reset_mask {mask!r} must be a bool array of shape ({num_envs},), True at least once"
+        )
+    return mask
 
 
 def checked_action(name: str, action: ArrayLike, dim: int) -> NDArray[Any]:

@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from rpg.envs.checks import checked_render_mode
+from rpg.envs.checks import checked_render_mode, checked_reset_mask
 from rpg.envs.layouts import LAYOUTS, MazeLayout
 from rpg.envs.maze_picture import Frame, MazeCanvas
 from rpg.envs.maze_tracker import MazeTracker
@@ -160,23 +160,7 @@ class MazeVectorEnv(VectorEnv[Array, Array, Array]):
 
         Seeds are accepted as in ``SyncVectorEnv`` and change nothing.
         """
-        if seed is not None and not isinstance(seed, int) and len(seed) != self.num_envs:
-            raise RPGError(
-                f"maze reset: {len(seed)} seeds for {self.num_envs} environments; give one for each"
-            )
-        mask = np.ones(self.num_envs, dtype=np.bool_) if options is None else options.get("reset_mask")
-        if mask is None:
-            mask = np.ones(self.num_envs, dtype=np.bool_)
-        if (
-            not isinstance(mask, np.ndarray)
-            or mask.dtype != np.bool_
-            or mask.shape != (self.num_envs,)
-            or not mask.any()
-        ):
-            raise RPGError(
-                f"maze reset: reset_mask {mask!r} must be a bool array of shape ({self.num_envs},), "
-                "True at least once"
-            )
+        mask = checked_reset_mask("maze", self.num_envs, seed, options)
         self._position[mask] = self.layout.start
         self._elapsed[mask] = 0
         return self._position.astype(np.float32), {}

@@ -12,7 +12,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from rpg.envs.checks import checked_action, checked_render_mode
+from rpg.envs.checks import checked_action, checked_render_mode, checked_reset_mask
 from rpg.envs.single import SingleEnv
 from rpg.errors import RPGError
 from rpg.exploration.objects import ObjectsOfInterest
@@ -111,23 +111,7 @@ class PlasticineVectorEnv(VectorEnv[Array, Array, Array]):
 
         Seeds are accepted as in ``SyncVectorEnv`` and change nothing.
         """
-        if seed is not None and not isinstance(seed, int) and len(seed) != self.num_envs:
-            raise RPGError(
-                f"{self.name} reset: {len(seed)} seeds for {self.num_envs} environments; give one for each"
-            )
-        mask = None if options is None else options.get("reset_mask")
-        if mask is None:
-            mask = np.ones(self.num_envs, dtype=np.bool_)
-        if (
-            not isinstance(mask, np.ndarray)
-            or mask.dtype != np.bool_
-            or mask.shape != (self.num_envs,)
-            or not mask.any()
-        ):
-            raise RPGError(
-                f"{self.name} reset: reset_mask {mask!r} must be a bool array of shape ({self.num_envs},), "
-                "True at least once"
-            )
+        mask = checked_reset_mask(self.name, self.num_envs, seed, options)
         self._elapsed[mask] = 0
         self._state = self._start if mask.all() else _replaced(self._state, self._start, mask)
         return self._observe(), {}

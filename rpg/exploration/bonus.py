@@ -10,7 +10,7 @@ from torch import Tensor
 from rpg.compiling import keep_address
 from rpg.errors import RPGError
 from rpg.exploration.normalizer import RunningNormalizer
-from rpg.flat import FlatAdam
+from rpg.flat import FlatAdam, keep_in_place
 from rpg.segments import SegmentBatch
 
 
@@ -77,8 +77,7 @@ class ExplorationBonus:
 
     def compile(self) -> None:
         """Compile what is worth it; results are those of the plain functions up to rounding."""
-        optimizer = self._optimizer
-        keep_address(optimizer.vector, optimizer.mean, optimizer.square, optimizer.count)
+        keep_in_place(self._optimizer)
         keep_address(*self._normalizer.buffers())
 
     def observe(self, obs: Tensor) -> None:

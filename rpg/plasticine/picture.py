@@ -17,6 +17,7 @@ from rpg.plasticine.scene import Scene
 from rpg.plasticine.scenes import BodyConfig, SceneConfig
 from rpg.plasticine.state import State
 from rpg.plasticine.targets import PUBLIC_GRID, SDF_THRESHOLD
+from rpg.videos import video_writer
 
 Frame = NDArray[np.uint8]
 Colour = tuple[float, float, float]
@@ -241,7 +242,7 @@ def film(
     state = scene.initial_state()
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with _writer(path, fps) as writer:
+        with video_writer(path, fps) as writer:
             writer.append_data(painter.frame(state))
             for action in actions:
                 state = scene.step(state, action, softness)
@@ -252,13 +253,3 @@ def film(
     except OSError as error:
         raise RPGError(f"video {path}: {error.strerror or error}; choose another place") from error
     return state
-
-
-def _writer(path: Path, fps: float) -> Any:
-    import imageio.v2 as imageio  # starts ffmpeg's search; not needed for single pictures
-
-    if path.suffix == ".gif":
-        return imageio.get_writer(path, duration=1000 / fps, loop=0)
-    if path.suffix != ".mp4":
-        raise RPGError(f"video {path}: choose a name that ends with .mp4 or .gif")
-    return imageio.get_writer(path, fps=fps, codec="libx264", quality=7, macro_block_size=2)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import imageio.v2 as imageio
 import numpy as np
 import torch
 from gymnasium.vector import VectorEnv, VectorWrapper
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 from rpg.agents.agent import Agent
 from rpg.errors import RPGError
 from rpg.training.runner import Runner
+from rpg.videos import video_writer
 
 _HOLD = 0.5  # seconds that the last picture of an episode stays
 
@@ -47,7 +47,7 @@ def film(
         torch.manual_seed(seed)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            with _writer(path, fps) as writer:
+            with video_writer(path, fps) as writer:
                 camera = _Camera(envs, writer, episodes, max(1, round(_HOLD * fps)), name)
                 runner = Runner(agent, camera, seed, name)
                 runner.reset()
@@ -91,11 +91,3 @@ class _Camera(VectorWrapper):
         even = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)))  # as the codec wants it
         for _ in range(times):
             self._writer.append_data(even)
-
-
-def _writer(path: Path, fps: float) -> Any:
-    if path.suffix == ".gif":
-        return imageio.get_writer(path, duration=1000 / fps, loop=0)
-    if path.suffix != ".mp4":
-        raise RPGError(f"video {path}: choose a name that ends with .mp4 or .gif")
-    return imageio.get_writer(path, fps=fps, codec="libx264", quality=7, macro_block_size=2)
