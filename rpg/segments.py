@@ -22,6 +22,7 @@ class SegmentBatch(NamedTuple):
         latent: (N, latent_dim), the z that acted.
         step: (N,), steps since the episode began at the first observation.
         bonus: (K, N), exploration reward of ``next_obs`` as judged now; None without exploration.
+        place: (N,), where replay keeps each first transition; None where replay does not ask for its novelty.
     """
 
     obs: Tensor
@@ -33,6 +34,7 @@ class SegmentBatch(NamedTuple):
     latent: Tensor
     step: Tensor
     bonus: Tensor | None = None
+    place: Tensor | None = None
 
     def total_reward(self, scale: float) -> Tensor:
         """(K, N): the environment's reward times ``scale``, plus the bonus as it is."""

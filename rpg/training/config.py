@@ -21,6 +21,11 @@ class TrainerConfig:
         decisions_per_update: decisions per gradient update (5 in Table 3.1); below 1 several updates to a
             decision; 0 never learns.
         replay_capacity: transitions kept.
+        recent_fraction: share of a batch drawn from the newest transitions alone (as published 0), so that
+            model and values are corrected sooner where the policy is now.
+        recent_window: how many transitions count as the newest.
+        novel_fraction: share of a batch drawn in proportion to the exploration bonus (as published 0), so that
+            rare events are learned from; see :class:`rpg.training.priorities.NoveltyPriorities`.
         log_every: between log rows.
         eval_every: between evaluations; 0 never.
         eval_episodes: per evaluation and mode.
@@ -34,6 +39,9 @@ class TrainerConfig:
     seed_decisions: int = 1000
     decisions_per_update: float = 5
     replay_capacity: int = 800_000
+    recent_fraction: float = 0.0
+    recent_window: int = 5000
+    novel_fraction: float = 0.0
     log_every: int = 1000
     eval_every: int = 20_000
     eval_episodes: int = 10
@@ -43,12 +51,20 @@ class TrainerConfig:
     video_every: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("steps", "log_every", "checkpoint_every", "eval_episodes", "eval_envs"):
+        for name in ("steps", "recent_window", "log_every", "checkpoint_every", "eval_episodes", "eval_envs"):
             if getattr(self, name) < 1:
                 raise RPGError(f"trainer.{name}={getattr(self, name)}: must be at least 1")
         for name in ("seed_decisions", "decisions_per_update", "eval_every", "picture_every", "video_every"):
             if getattr(self, name) < 0:
                 raise RPGError(f"trainer.{name}={getattr(self, name)}: must not be negative")
+        for name in ("recent_fraction", "novel_fraction"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise RPGError(f"trainer.{name}={getattr(self, name)}: must be between 0 and 1")
+        if self.recent_fraction + self.novel_fraction > 1:
+            raise RPGError(
+                f"trainer.recent_fraction={self.recent_fraction} and novel_fraction={self.novel_fraction}: "
+                "together at most 1"
+            )
 
 
 @dataclass

@@ -12,6 +12,7 @@ from rpg.errors import RPGError
 from rpg.pixels import FrameShape
 from rpg.segments import SegmentBatch
 from rpg.training.frames import FrameRing
+from rpg.training.priorities import NoveltyPriorities
 
 
 class SegmentReplay:
@@ -31,6 +32,7 @@ class SegmentReplay:
         device: where the ring lives.
         frames: what an observation consists of, if it is pictures.
         with_bonus: whether a transition's exploration reward is stored with it, as judged when it was made.
+        prioritized: whether transitions can be drawn by their novelty.
     """
 
     def __init__(
@@ -43,6 +45,7 @@ class SegmentReplay:
         device: torch.device | str = "cpu",
         with_bonus: bool = False,
         frames: FrameShape | None = None,
+        prioritized: bool = False,
     ) -> None:
         self._frames = FrameRing(frames, num_envs, capacity, device) if frames else None
         obs_dim = frames.stack if frames else obs_dim
@@ -52,6 +55,7 @@ class SegmentReplay:
         if self._rows < 2:
             raise RPGError(f"replay capacity={capacity} holds fewer than 2 steps of {num_envs} environments")
         self._data = torch.empty(self._rows, num_envs, sum(self._widths), device=device)
+        self.priorities = NoveltyPriorities(self._rows, num_envs, device) if prioritized else None
         self._head = 0  # next row to write
         self._filled = 0  # rows that hold data
         self._episode_step = torch.zeros(num_envs, 1, device=device)
@@ -100,10 +104,14 @@ class SegmentReplay:
             out=row,
         )
         self._episode_step = torch.where(ended, 0.0, self._episode_step + 1)
+        if self.priorities is not None:
+            self.priorities.add(self._head)
         self._head = (self._head + 1) % self._rows
         self._filled = min(self._filled + 1, self._rows)
         if self._frames is not None:
             while self._needs[(self._head - self._filled) % self._rows] < self._frames.oldest:
+                if self.priorities is not None:
+                    self.priorities.forget((self._head - self._filled) % self._rows)
                 self._filled -= 1
 
     def _store_frames(
@@ -130,7 +138,12 @@ class SegmentReplay:
         self._episode_step.zero_()
 
     def sample(
-        self, batch_size: int, horizon: int, recent_fraction: float = 0.0, recent_window: int = 5000
+        self,
+        batch_size: int,
+        horizon: int,
+        recent_fraction: float = 0.0,
+        recent_window: int = 5000,
+        novel_fraction: float = 0.0,
     ) -> SegmentBatch:
         """Draw ``batch_size`` segments of ``horizon`` steps, uniform over stored transitions.
 
@@ -140,19 +153,25 @@ class SegmentReplay:
             recent_fraction: share of the batch drawn from the newest ``recent_window`` transitions alone,
                 so that a discovery is learned from while it is still news.
             recent_window: in transitions.
+            novel_fraction: share drawn in proportion to :attr:`priorities`.
         """
         if not self._filled:
             raise RPGError("replay is empty: add transitions before sampling")
         device = self._data.device
+        oldest = self._head - self._filled
         age = torch.randint(self._filled, (batch_size,), device=device)  # 0 is the oldest row
         recent = round(batch_size * recent_fraction)
         if recent:
             window = min(self._filled, max(recent_window // self._num_envs, 1))
             age[:recent] = torch.randint(self._filled - window, self._filled, (recent,), device=device)
         env = torch.randint(self._num_envs, (batch_size,), device=device)
+        novel = round(batch_size * novel_fraction)
+        if self.priorities is not None and novel:
+            index = self.priorities.draw(novel)
+            age[-novel:] = (index // self._num_envs - oldest) % self._rows
+            env[-novel:] = index % self._num_envs
         steps = torch.arange(horizon, device=device).unsqueeze(1)
         ages = age + steps  # (K, N)
-        oldest = self._head - self._filled
         # Beyond the newest row nothing is known yet: such steps are masked like those after an ending.
         rows = (oldest + ages.clamp(max=self._filled - 1)) % self._rows
         picked = self._data[rows, env]  # (K, N, width)
@@ -177,6 +196,7 @@ class SegmentReplay:
             latent=latent[0],
             step=step[0, :, 0],
             bonus=bonus.squeeze(-1) if self._widths[5] else None,
+            place=rows[0] * self._num_envs + env if self.priorities is not None else None,
         )
 
     def state_dict(self) -> dict[str, Any]:
@@ -185,10 +205,12 @@ class SegmentReplay:
         frames = {}
         if self._frames is not None:
             frames = self._frames.state_dict() | {"needs": torch.from_numpy(self._needs[rows])}
+        stored = torch.from_numpy(rows).to(self._data.device)
         return {
-            "data": self._data[torch.from_numpy(rows).to(self._data.device)],
+            "data": self._data[stored],
             "episode_step": self._episode_step.clone(),
             "frames": frames,
+            "priorities": self.priorities.state_dict(stored) if self.priorities is not None else {},
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -203,6 +225,8 @@ class SegmentReplay:
         if self._frames is not None:
             self._frames.load_state_dict(state["frames"])
             self._needs[: len(data)] = state["frames"]["needs"].numpy()
+        if self.priorities is not None:
+            self.priorities.load_state_dict(state["priorities"])
         self._filled = len(data)
         self._head = len(data) % self._rows
         self._episode_step.copy_(state["episode_step"])

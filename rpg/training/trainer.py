@@ -16,7 +16,7 @@ from torch import Tensor
 from rpg import compiling
 from rpg.agents.agent import Agent
 from rpg.envs.base import Restorable, Tracked
-from rpg.errors import NonFiniteError
+from rpg.errors import NonFiniteError, RPGError
 from rpg.exploration import ExplorationBonus
 from rpg.training.checkpoint import load_checkpoint, save_checkpoint
 from rpg.training.config import TrainerConfig
@@ -71,6 +71,11 @@ class Trainer:
         self._loggers, self._seed, self._plain = loggers, seed, plain_config or {}
         self._env_name, self._repeat = env_name, action_repeat
         self._envs, self._restorable = envs, isinstance(envs, Restorable)
+        if config.novel_fraction and exploration is None:
+            raise RPGError(
+                f"trainer.novel_fraction={config.novel_fraction}: novelty is judged by an exploration bonus; "
+                "choose exploration=rnd, or 0"
+            )
         self._runner = Runner(agent, envs, seed, env_name)
         self._replay = SegmentReplay(
             agent.obs_dim,
@@ -81,6 +86,7 @@ class Trainer:
             agent.device,
             with_bonus=exploration is not None and not exploration.config.relabel,
             frames=agent.frames,
+            prioritized=config.novel_fraction > 0,
         )
         self._tracker = envs.make_tracker() if isinstance(envs, Tracked) else None
         self.decisions = self.updates = self._ticks = 0
@@ -210,9 +216,18 @@ class Trainer:
 
     def update_agent(self) -> None:
         """Sample segments, judge their novelty as it is now, and let the agent learn from them."""
-        batch = self._replay.sample(self.agent.batch_size, self.agent.horizon)
+        batch = self._replay.sample(
+            self.agent.batch_size,
+            self.agent.horizon,
+            self.config.recent_fraction,
+            self.config.recent_window,
+            self.config.novel_fraction,
+        )
         if self.exploration is not None and self.exploration.config.relabel:
             batch = self.exploration.relabel(batch)
+        if self._replay.priorities is not None and batch.place is not None and batch.bonus is not None:
+            self._replay.priorities.judge(batch.place, batch.bonus.amax(0))
+            batch = batch._replace(place=None)
         self._add(self.agent.update(batch, self.env_steps))
         self.updates += 1
 

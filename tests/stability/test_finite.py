@@ -12,9 +12,13 @@ from record import record
 from tiny import leaves, make_agent, make_rnd, noise_batch
 
 from rpg.agents import RPG
+from rpg.compiling import compiler_missing
 from rpg.exploration import RandomNetworkDistillation
 
 KINDS = ["constant", "zero", "huge"]
+COMPILED = not compiler_missing(
+    torch.device("cpu")
+)  # in the long forms, as runs ship it; the short are plain
 
 
 class Trained(NamedTuple):
@@ -26,8 +30,11 @@ class Trained(NamedTuple):
     not_finite: set[str]
 
 
-def train(kind: str, updates: int) -> Trained:
+def train(kind: str, updates: int, compiled: bool = False) -> Trained:
     agent, rnd = make_agent(), make_rnd(forgetting=0.001)
+    if compiled:
+        agent.compile()
+        rnd.compile()
     largest, not_finite = 0.0, set()
     for i in range(updates):
         data = noise_batch(agent, kind)
@@ -115,21 +122,23 @@ def test_an_unclipped_moment_is_seen() -> None:
 @pytest.mark.parametrize("kind", KINDS)
 def test_losses_and_statistics_stay_finite_for_1e5_updates(kind: str) -> None:
     begun = time.perf_counter()
-    agent, rnd, largest, not_finite = train(kind, 100_000)
+    agent, rnd, largest, not_finite = train(kind, 100_000, compiled=COMPILED)
     broken = [*sorted(not_finite), *unsound(agent, rnd), *standing_still(start(), agent, rnd)]
     wall_s = time.perf_counter() - begun
-    settings = {"observations": kind, "updates": 100_000}
+    settings = {"observations": kind, "updates": 100_000, "compiled": COMPILED}
     record("finite_losses", 0, settings, "largest_state_loss", largest, largest < 1e6, wall_s)
     record("finite_statistics", 0, settings, "broken", len(broken), not broken, wall_s)
     assert broken == []
     assert largest < 1e6
 
 
-def alpha_after(updates: int, entropy_target: float) -> tuple[float, RPG]:
+def alpha_after(updates: int, entropy_target: float, compiled: bool = False) -> tuple[float, RPG]:
     """Entropy weight after chasing a target that no tanh-normal can reach (or can never fall below)."""
     agent = make_agent(entropy_target=entropy_target, max_alpha=2.0)
     # Faster than any setting we ship, so that few updates show what many would do.
     agent._aux_optimizer.lr = 0.1
+    if compiled:
+        agent.compile()
     for _ in range(updates):
         agent.update(noise_batch(agent, "ordinary"))
     return float(agent.alpha), agent
@@ -152,7 +161,7 @@ def test_alpha_falls_towards_zero_but_never_below() -> None:
 @pytest.mark.long
 def test_alpha_stays_bounded_for_1e5_updates() -> None:
     start = time.perf_counter()
-    alpha, agent = alpha_after(100_000, entropy_target=50.0)
+    alpha, agent = alpha_after(100_000, entropy_target=50.0, compiled=COMPILED)
     finite = all(bool(p.isfinite().all()) for p in agent.policy.parameters())
     passed = finite and alpha <= 2.001
     record("alpha_bounded", 0, {"entropy_target": 50.0, "updates": 100_000}, "alpha", alpha, passed,

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +15,10 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from rpg.agents import Agent
-from rpg.errors import NonFiniteError
+from rpg.errors import NonFiniteError, RPGError
 from rpg.exploration import ObjectsOfInterest, RandomNetworkDistillation, RNDConfig
 from rpg.segments import SegmentBatch
-from rpg.train import train
+from rpg.train import assemble, train
 from rpg.training.checkpoint import load_checkpoint
 from rpg.training.config import TrainerConfig
 from rpg.training.loggers import Loggers, read_rows
@@ -90,6 +91,59 @@ def test_updates_start_after_the_seed_decisions_and_keep_their_rate(tmp_path: Pa
         100,
     ]  # the first vector step at or after each multiple of 10
     assert trainer.updates == 6
+
+
+def test_a_share_of_every_batch_is_of_the_newest_transitions(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trainer, agent = make(
+        tmp_path, num_envs=1, steps=300, seed_decisions=200, recent_fraction=0.5, recent_window=3
+    )
+    age: list[Tensor] = []
+
+    def measure(batch: SegmentBatch, env_steps: int = 0) -> dict[str, Tensor]:
+        age.append(env_steps - batch.next_obs[0, :, 0])  # the environment observes how old it is
+        return {}
+
+    monkeypatch.setattr(agent, "update", measure)
+    trainer.train()
+    newest, others = torch.stack(age).split(agent.batch_size // 2, dim=1)
+    assert newest.max() <= 2
+    assert others.mean() > 50
+
+
+def test_what_a_batch_says_of_novelty_is_remembered(composed: Composed, tmp_path: Path) -> None:
+    """The share by novelty is drawn more often where the bonus is larger."""
+    cfg = composed(
+        "experiment=debug", "trainer.novel_fraction=0.5", "trainer.eval_every=0", f"run_dir={tmp_path}"
+    )
+    trainer, _ = assemble(cfg)
+    with closing(trainer):
+        trainer.train()
+        assert trainer.exploration is not None
+        torch.manual_seed(0)
+        batch = trainer.exploration.relabel(trainer._replay.sample(4000, 1, novel_fraction=0.5))
+        assert batch.bonus is not None
+        uniform, novel = batch.bonus[0].split(2000)
+        assert novel.clamp(min=0).mean() > 1.2 * uniform.clamp(min=0).mean()
+
+
+def test_novelty_needs_somebody_to_judge_it(composed: Composed) -> None:
+    with pytest.raises(
+        RPGError, match="trainer.novel_fraction=0.5: novelty is judged by an exploration bonus"
+    ):
+        assemble(composed("experiment=debug", "trainer.novel_fraction=0.5", "exploration=none"))
+
+
+def test_shares_of_a_batch_sum_to_one_at_most() -> None:
+    with pytest.raises(RPGError, match="together at most 1"):
+        TrainerConfig(recent_fraction=0.6, novel_fraction=0.6)
+
+
+@pytest.mark.parametrize("fraction", [-0.1, 1.1])
+def test_an_impossible_share_of_newest_transitions_is_refused(fraction: float) -> None:
+    with pytest.raises(RPGError, match=f"trainer.recent_fraction={fraction}: must be between 0 and 1"):
+        TrainerConfig(recent_fraction=fraction)
 
 
 def test_no_learning_where_none_is_asked_for(tmp_path: Path) -> None:
