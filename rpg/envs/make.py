@@ -11,6 +11,7 @@ from typing import Any
 import gymnasium as gym
 from gymnasium.vector import AutoresetMode, VectorEnv
 
+from rpg.attributes import declared
 from rpg.envs.config import EnvConfig
 from rpg.envs.goals import FlatGoals
 from rpg.envs.headless import prefer_offscreen_gl
@@ -104,7 +105,8 @@ def objects_of_interest(config: EnvConfig, envs: VectorEnv[Any, Any, Any], obs_d
         RPGError: an entry that the observation does not have, or scales that do not fit.
     """
     if config.objects is None:
-        return _declared(envs) or ObjectsOfInterest.everything(obs_dim)
+        own = declared(envs, "objects_of_interest")
+        return own if isinstance(own, ObjectsOfInterest) else ObjectsOfInterest.everything(obs_dim)
     unknown = sorted(config.objects.keys() - {"index", "scale", "offset"})
     index = config.objects.get("index")
     if unknown or not isinstance(index, list) or not all(type(i) is int for i in index):
@@ -117,13 +119,3 @@ def objects_of_interest(config: EnvConfig, envs: VectorEnv[Any, Any, Any], obs_d
             f"env.objects.index={index}: the observation of '{config.id}' has the entries 0 to {obs_dim - 1}"
         )
     return ObjectsOfInterest.of(index, config.objects.get("scale", 1.0), config.objects.get("offset", 0.0))
-
-
-def _declared(envs: VectorEnv[Any, Any, Any]) -> ObjectsOfInterest | None:
-    own = getattr(envs, "objects_of_interest", None)
-    if own is None and hasattr(envs, "get_attr"):
-        try:
-            own = envs.get_attr("objects_of_interest")[0]
-        except AttributeError:
-            return None
-    return own if isinstance(own, ObjectsOfInterest) else None
