@@ -21,7 +21,7 @@ import numpy as np
 from curve_panels import STAND_INS, label_of, published_points
 from curves import table_of
 from explored_states import table_of as states_of
-from figure_3_13 import NOT_PUBLISHED, PANELS, VARIANTS
+from figure_3_13 import FULL_SEEDS, FULL_STEPS, NOT_PUBLISHED, PANELS, VARIANTS
 from figures import FIGURES, MEASURES, STATES, Panel, panels_of
 
 from rpg.cli import report_errors
@@ -31,6 +31,7 @@ from rpg.stats import iqm, stratified_bootstrap
 from rpg.training.loggers import write_atomic
 
 _OUT = Path("docs/results.md")
+_FIG3_5 = {"rpg": "rpg_r", "mbsac": "mbsac_r"}  # variants of scripts/maze_coverage.py
 _MISSING = "missing"
 _HEAD = f"""# Results
 
@@ -100,12 +101,9 @@ def _task(panel: Panel, recorded: Mapping[str, list[RecordedRun]], figure: str) 
             lines.append("\nBlocks in place / 2, which is what was published:\n")
         lines += _table_head(_COLUMNS)
         for method in (*panel.methods, *others):
-            # What was published of this task is its score where it has one.
-            known = (
-                None
-                if len(measures) > 1 and measure != "score"
-                else published.get(STAND_INS.get(method, method))
-            )
+            known = _published(published.get(STAND_INS.get(method, method)))
+            if measure != measures[-1]:
+                known = "blocks alone, below"
             lines.append(_row(_method_row(method, panel, recorded.get(method, []), measure, known)))
         lines += [
             _row([f"{label_of(method)}, published alone", *["-"] * 8, _published(points), "-"])
@@ -120,12 +118,11 @@ def _method_row(
     panel: Panel,
     runs: Sequence[RecordedRun],
     measure: str,
-    published: Sequence[tuple[int, float]] | None,
+    known: str,
 ) -> list[str]:
     name = f"`{method}`" + (f" ({label_of(method)})" if label_of(method) != method else "")
     if method in STAND_INS:
         name += f", for {label_of(STAND_INS[method])}"
-    known = _published(published)
     runs = [run for run in runs if np.isfinite(run.measures[measure]).any()]
     if not runs:
         return [name, f"**{_MISSING}**", *["-"] * 7, known, "-"]
@@ -216,7 +213,7 @@ def _maze() -> str:
     for variant, panels in VARIANTS.items():
         known = published.get(variant, "not published")
         lines.append(_row([f"`{variant}`", panels, *_coverage_cells(runs.get(variant, {}), 3), known]))
-    runs = _coverage(Path("results/maze/coverage.csv"), {"rpg": "rpg_r", "mbsac": "mbsac_r"})
+    runs = _coverage(Path("results/maze/coverage.csv"), _FIG3_5)
     for variant, of in (("rpg_r", "gaussian12"), ("mbsac_r", "no_latent")):
         cells = _coverage_cells(runs.get(variant, {}), 5)
         lines.append(_row([f"`{variant}`", "Fig. 3.5", *cells, published[of]]))
@@ -299,39 +296,42 @@ def _missing(
         "Against the whole evaluation of each figure, with the commands that go on with it.\n",
     ]
     for figure, panel in panels:
-        lines += _missing_of(figure, panel, recorded[panel.task])
-    held = _coverage(Path("results/fig3_13/runs.csv"), {name: name for name in VARIANTS})
-    absent = [name for name in VARIANTS if name not in held and name not in NOT_PUBLISHED]
-    if absent:
-        lines.append(f"* Fig. 3.13: {_codes(absent)}. `python scripts/figures.py fig3_13 run`")
+        runs = recorded[panel.task]
+        ends = {method: [run.decisions for run in runs.get(method, [])] for method in panel.methods}
+        place = f"{_figure(figure)}, {panel.task}"
+        lines += _lacking(place, ends, panel.decisions, panel.seeds, "decisions", panel.preset)
+    fig3_5 = _ends(_coverage(Path("results/maze/coverage.csv"), _FIG3_5), _FIG3_5.values())
+    [maze] = panels_of("fig3_5")
+    lines += _lacking("Fig. 3.5", fig3_5, maze.decisions, maze.seeds, "env steps", "fig3_5")
+    variants = {name: name for name in VARIANTS if name not in NOT_PUBLISHED}
+    fig3_13 = _ends(_coverage(Path("results/fig3_13/runs.csv"), variants), variants)
+    lines += _lacking("Fig. 3.13", fig3_13, FULL_STEPS, FULL_SEEDS, "env steps", "fig3_13")
     for figure in STATES:
         tasks = [panel.task for panel in panels_of(figure) if not states_of(panel.task).exists()]
         if tasks:
-            lines.append(
-                f"* {_figure(figure)}: states of {_codes(tasks)}. `python scripts/figures.py {figure} run`"
-            )
+            command = f"`python scripts/figures.py {figure} run`"
+            lines.append(f"* {_figure(figure)}: states of {_codes(tasks)}. {command}")
     return "\n".join(lines if len(lines) > 2 else [*lines, "Nothing."]) + "\n"
 
 
-def _missing_of(figure: str, panel: Panel, recorded: Mapping[str, list[RecordedRun]]) -> list[str]:
-    absent, partial = [], []
-    for method in panel.methods:
-        runs = recorded.get(method, [])
-        whole = sum(run.decisions >= 0.99 * panel.decisions for run in runs)
-        if not runs:
-            absent.append(method)
-        elif whole < panel.seeds:
-            partial.append(
-                f"`{method}` ({whole} of {panel.seeds} seeds at {short_count(panel.decisions)} decisions)"
-            )
-    told = "; ".join(
-        [
-            *([f"nothing of {_codes(absent)}"] if absent else []),
-            *([f"part of {', '.join(partial)}"] if partial else []),
-        ]
-    )
-    command = f"`python scripts/figures.py {panel.preset} run`"
-    return [f"* {_figure(figure)}, {panel.task}: {told}. {command}"] if told else []
+def _lacking(
+    place: str, ends: Mapping[str, Sequence[int]], length: int, seeds: int, unit: str, figure: str
+) -> list[str]:
+    """A line that says which curves have no runs, and which too few or too short ones; none if all is there."""
+    absent = [name for name, each in ends.items() if not each]
+    whole = {name: sum(end >= 0.99 * length for end in each) for name, each in ends.items()}
+    partial = [
+        f"`{name}` ({count} of {seeds} seeds)"
+        for name, count in whole.items()
+        if ends[name] and count < seeds
+    ]
+    told = [f"nothing of {_codes(absent)}"] if absent else []
+    told += [f"not all of {', '.join(partial)} at {short_count(length)} {unit}"] if partial else []
+    return [f"* {place}: {'; '.join(told)}. `python scripts/figures.py {figure} run`"] if told else []
+
+
+def _ends(runs: Mapping[str, Mapping[str, Mapping[str, str]]], names: Iterable[str]) -> dict[str, list[int]]:
+    return {name: [int(row["env_steps"]) for row in runs.get(name, {}).values()] for name in names}
 
 
 def _figure(name: str) -> str:
