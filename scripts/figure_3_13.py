@@ -33,7 +33,7 @@ from rpg.figures import curve, new_figure, save, steps_axis, style_axes
 from rpg.stats import iqm, stratified_bootstrap
 
 _RUNS, _OUT = Path("runs/fig3_13"), Path("results/fig3_13")
-_PUBLISHED = Path(__file__).parents[1] / "results" / "published"
+PUBLISHED = Path(__file__).parents[1] / "results" / "published"
 _COLUMNS = ["panel", "variant", "seed", "env_steps", "coverage", "wall_s"]
 FULL_STEPS, FULL_SEEDS = 240_000, 3
 
@@ -163,11 +163,11 @@ def _published() -> dict[tuple[str, str], list[tuple[int, float]]]:
     """By panel and variant; panel A has whole curves."""
     points: dict[tuple[str, str], list[tuple[int, float]]] = defaultdict(list)
     columns = {"gaussian12": "rpg_gaussian12", "categorical12": "rpg_categorical12", "no_latent": "mbsac"}
-    for row in _read(_PUBLISHED / "maze_coverage.csv"):
+    for row in _read(PUBLISHED / "maze_coverage.csv"):
         for variant, column in columns.items():
             if row[column]:
                 points["A", variant].append((int(row["decisions"]), float(row[column])))
-    for row in _read(_PUBLISHED / "fig3_13.csv"):
+    for row in _read(PUBLISHED / "fig3_13.csv"):
         points[row["panel"], row["variant"]].append((int(row["env_steps"]), float(row["coverage"])))
     return points
 

@@ -20,6 +20,7 @@ import argparse
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -90,7 +91,8 @@ class Panel:
         return Path(path)
 
 
-def panels_of(name: str) -> list[Panel]:
+@cache
+def panels_of(name: str) -> tuple[Panel, ...]:
     """The panels of a figure, or of one of its presets.
 
     Raises:
@@ -112,7 +114,7 @@ def panels_of(name: str) -> list[Panel]:
             )
             for task in swept.get("env", [cfg.hydra.runtime.choices.env])
         ]
-    return found
+    return tuple(found)
 
 
 def jobs_of(name: str, args: argparse.Namespace) -> list[Job]:

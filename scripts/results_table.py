@@ -21,7 +21,7 @@ import numpy as np
 from curve_panels import STAND_INS, label_of, published_points
 from curves import table_of
 from explored_states import table_of as states_of
-from figure_3_13 import FULL_SEEDS, FULL_STEPS, NOT_PUBLISHED, PANELS, VARIANTS
+from figure_3_13 import FULL_SEEDS, FULL_STEPS, NOT_PUBLISHED, PANELS, PUBLISHED, VARIANTS
 from figures import FIGURES, MEASURES, STATES, Panel, panels_of
 
 from rpg.cli import report_errors
@@ -209,7 +209,7 @@ def _maze() -> str:
     )
     lines += _table_head(("variant", "panels", "coverage", "seeds", "env steps", "wall time", "published"))
     runs = _coverage(Path("results/fig3_13/runs.csv"), {name: name for name in VARIANTS})
-    published = {row["variant"]: row["coverage"] for row in _csv(Path("results/published/fig3_13.csv"))}
+    published = {row["variant"]: row["coverage"] for row in _csv(PUBLISHED / "fig3_13.csv")}
     for variant, panels in VARIANTS.items():
         known = published.get(variant, "not published")
         lines.append(_row([f"`{variant}`", panels, *_coverage_cells(runs.get(variant, {}), 3), known]))
