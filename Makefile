@@ -43,10 +43,11 @@ format: $(VENV)/.dev
 docs: $(VENV)/.docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
-# Redraws the published figures from results/.
+# Redraws from results/ every figure that has some, and the page of results.
 figures: $(VENV)/.core
-	$(BIN)/python scripts/figure_maze.py draw
 	$(BIN)/python scripts/figure_bandit.py --redraw
+	$(BIN)/python scripts/figures.py all draw
+	$(BIN)/python scripts/results_table.py
 
 bench: $(VENV)/.core
 	$(BIN)/python benchmarks/learning.py --against eager --out benchmarks/output

@@ -21,6 +21,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from rpg.budget import within_budget
 from rpg.conf import compose_config
 from rpg.errors import RPGError, nearest
 
@@ -127,6 +128,8 @@ def check_overrides(args: list[str], config: str = "config") -> None:
     ]
     removed = [a for a in args if a.startswith("~")]
     cfg = _compose([*single, *removed], config)
+    if "budget" in cfg:  # of a figure's preset; a sweep would meet it too late to say so in one line
+        within_budget(cfg.budget, 1, 1)
     # Hydra names the folder after the overrides of our keys, not after its own.
     named = ",".join(
         text

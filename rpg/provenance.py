@@ -81,5 +81,6 @@ def provenance() -> dict[str, Any]:
         "platform": platform.platform(terse=True),
         "cpu": cpu_name(),
         "cores": os.cpu_count(),
+        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
         "threads": torch.get_num_threads(),
     }

@@ -24,16 +24,18 @@ from typing import Any
 
 import numpy as np
 from side_by_side import Job, run_side_by_side, write_table
+from what_was_run import what_was_run
 
+from rpg.budget import within_budget
 from rpg.cli import report_errors
 from rpg.errors import RPGError
-from rpg.figures import curve, new_figure, save, short_count, steps_axis, style_axes
+from rpg.figures import curve, new_figure, save, steps_axis, style_axes
 from rpg.stats import iqm, stratified_bootstrap
 
 _RUNS, _OUT = Path("runs/fig3_13"), Path("results/fig3_13")
-_PUBLISHED = Path(__file__).parents[1] / "results" / "published"
+PUBLISHED = Path(__file__).parents[1] / "results" / "published"
 _COLUMNS = ["panel", "variant", "seed", "env_steps", "coverage", "wall_s"]
-FULL_STEPS, FULL_SEEDS = 240_000, (0, 1, 2)
+FULL_STEPS, FULL_SEEDS = 240_000, 3
 
 PANELS: dict[str, tuple[str, dict[str, str]]] = {
     "A": ("latent space", {
@@ -69,18 +71,6 @@ def job(variant: str, seed: int, steps: int) -> Job:
     """One run of a variant."""
     overrides = ("experiment=fig3_13", f"ablation={variant}", f"seed={seed}", f"trainer.steps={steps}")
     return Job(f"{variant} seed {seed}", _RUNS / variant / f"seed{seed}", overrides)
-
-
-def within_budget(budget: float) -> tuple[int, tuple[int, ...]]:
-    """Env steps and seeds of a share of the whole evaluation; at least 1000 steps and a seed.
-
-    Raises:
-        RPGError: the share is not in (0, 1].
-    """
-    if not 0 < budget <= 1:
-        raise RPGError(f"budget={budget}: must lie in (0, 1]")
-    steps = max(round(FULL_STEPS * budget / 1000), 1) * 1000
-    return steps, FULL_SEEDS[: max(round(len(FULL_SEEDS) * budget), 1)]
 
 
 def planned(names: Sequence[str], steps: int, seeds: Sequence[int]) -> list[Job]:
@@ -149,7 +139,7 @@ def draw() -> Path:
         ax.set_xlim(0, FULL_STEPS * 1.02)
         ax.set_ylim(0, 1.02)
         ax.legend(loc="lower right", frameon=False, fontsize=7)
-    fig.suptitle(what_was_run(runs), fontsize=8.5, x=0.01, ha="left")
+    fig.suptitle(told(runs), fontsize=8.5, x=0.01, ha="left")
     out = _OUT / "figure_3_13.png"
     save(fig, out, dpi=130)
     return out
@@ -162,35 +152,22 @@ def interval(seeds: dict[int, dict[int, float]]) -> tuple[list[int], np.ndarray,
     return shared, *stratified_bootstrap(scores[:, None, :], iqm)
 
 
-def what_was_run(runs: dict[tuple[str, str], dict[int, dict[int, float]]]) -> str:
-    """How much of the whole evaluation the curves are, from what they hold: steps, seeds, share, what is missing."""
-    variants = {name: [max(points) for points in seeds.values()] for (_, name), seeds in runs.items()}
-    expected = [name for name in VARIANTS if name not in NOT_PUBLISHED]
-    done = sum(min(end, FULL_STEPS) for name in expected for end in variants.get(name, [])[: len(FULL_SEEDS)])
-    share = done / (FULL_STEPS * len(FULL_SEEDS) * len(expected))
-    ends = [short_count(end) for end in sorted(end for each in variants.values() for end in each)]
-    counts = [str(count) for count in sorted(len(each) for each in variants.values())]
-    missing = [name for name in expected if name not in variants]
-    return (
-        f"{share:.0%} of the whole budget: {_span(ends)} of {short_count(FULL_STEPS)} env steps, {_span(counts)} of "
-        f"{len(FULL_SEEDS)} seeds (in brackets); dotted: published"
-        + (f"; not run: {', '.join(missing)}" if missing else "")
-    )
-
-
-def _span(values: list[str]) -> str:
-    return values[0] if values[0] == values[-1] else f"{values[0]} to {values[-1]}"
+def told(runs: dict[tuple[str, str], dict[int, dict[int, float]]]) -> str:
+    """How much of the whole evaluation the curves are."""
+    ends = {name: [max(points) for points in seeds.values()] for (_, name), seeds in runs.items()}
+    whole = {name: FULL_STEPS for name in VARIANTS if name not in NOT_PUBLISHED}
+    return what_was_run(ends, whole, FULL_SEEDS)
 
 
 def _published() -> dict[tuple[str, str], list[tuple[int, float]]]:
     """By panel and variant; panel A has whole curves."""
     points: dict[tuple[str, str], list[tuple[int, float]]] = defaultdict(list)
     columns = {"gaussian12": "rpg_gaussian12", "categorical12": "rpg_categorical12", "no_latent": "mbsac"}
-    for row in _read(_PUBLISHED / "maze_coverage.csv"):
+    for row in _read(PUBLISHED / "maze_coverage.csv"):
         for variant, column in columns.items():
             if row[column]:
                 points["A", variant].append((int(row["decisions"]), float(row[column])))
-    for row in _read(_PUBLISHED / "fig3_13.csv"):
+    for row in _read(PUBLISHED / "fig3_13.csv"):
         points[row["panel"], row["variant"]].append((int(row["env_steps"]), float(row["coverage"])))
     return points
 
@@ -214,13 +191,13 @@ def main(argv: list[str] | None = None) -> int:
         "--seeds", type=int, nargs="+", help="default: 0 1 2, or as many as the budget allows"
     )
     parser.add_argument(
-        "--budget", type=float, help="share of steps and seeds, in (0, 1]; the figure says so"
+        "--budget", type=float, default=1.0, help="share of steps and seeds, in (0, 1]; the figure says so"
     )
     parser.add_argument("--jobs", type=int, default=2, help="runs side by side")
     args = parser.parse_args(argv)
     names = args.variants or [name for name in VARIANTS if name not in NOT_PUBLISHED]
     with report_errors():
-        steps, seeds = within_budget(1.0 if args.budget is None else args.budget)
+        steps, seeds = within_budget(args.budget, FULL_STEPS, FULL_SEEDS)
         jobs = planned(names, args.steps or steps, args.seeds or seeds)
         if args.action == "list":
             for each in jobs:

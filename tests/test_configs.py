@@ -21,11 +21,11 @@ Composed = Callable[..., DictConfig]
 
 CONF = Path(rpg.conf.__file__).parent
 AGENTS = sorted(p.stem for p in (CONF / "agent").glob("*.yaml"))
-# Variants are RPG's alone, and tested with their figure.
+# Variants are RPG's alone, methods choose the agent themselves; both are tested with their figures.
 OPTIONS = sorted(
     (p.parent.name, p.stem)
     for p in CONF.glob("*/*.yaml")
-    if p.parent.name not in ("agent", "ablation") and not p.stem.startswith("fig3_13")
+    if p.parent.name not in ("agent", "ablation", "method") and not p.stem.startswith("fig3")
 )
 # What tells from a log row that an agent learned.
 LEARNERS = {

@@ -156,15 +156,6 @@ def test_list_has_every_run_once_with_its_command(
     assert "ABCDE" in lines[0]
 
 
-@pytest.mark.parametrize(("budget", "steps", "seeds"), [
-    (1.0, 240_000, (0, 1, 2)), (0.5, 120_000, (0, 1)), (0.25, 60_000, (0,)), (0.001, 1000, (0,)),
-])  # fmt: skip
-def test_budget_cuts_steps_and_seeds(
-    script: dict[str, Any], budget: float, steps: int, seeds: tuple[int, ...]
-) -> None:
-    assert script["within_budget"](budget) == (steps, seeds)
-
-
 @pytest.mark.parametrize("budget", ["0", "1.5", "-1", "nan"])
 def test_impossible_budgets_are_refused(
     script: dict[str, Any], budget: str, capsys: pytest.CaptureFixture[str]
@@ -211,7 +202,7 @@ def test_figure_is_drawn_and_says_how_much_was_run(script: dict[str, Any]) -> No
     assert script["main"](["draw"]) == 0
     assert Path("results/fig3_13/figure_3_13.png").read_bytes().startswith(b"\x89PNG")
     runs = {("A", v): {0: {1000: 0.1, 60_000: 0.2}, 1: {1000: 0.1}} for v in ("gaussian12", "no_latent")}
-    said = script["what_was_run"](runs)
+    said = script["told"](runs)
     assert said.startswith("1% of the whole budget: 1k to 60k of 240k env steps, 2 of 3 seeds")
     assert "not run: categorical12, beta_0.005" in said
     steps, mean, low, high = script["interval"]({0: {1000: 0.1, 2000: 0.4}, 1: {1000: 0.3}})

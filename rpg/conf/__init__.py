@@ -5,6 +5,10 @@ from __future__ import annotations
 from hydra import compose, initialize_config_module
 from omegaconf import DictConfig
 
+from rpg.budget import register_resolvers
+
+register_resolvers()
+
 
 def compose_config(*overrides: str, config: str = "config") -> DictConfig:
     """The config as the command line makes it from ``overrides``; ``config`` is the name of its first file.

@@ -214,7 +214,10 @@ def _sinks(run: RunConfig, run_dir: Path) -> list[Sink]:
 
 
 # Settings that may change between restarts without making it another run.
-_FREE = ("trainer.steps", "trainer.checkpoint_every", "device", "compile", "threads", "run_dir", "logger")
+_FREE = (
+    "trainer.steps", "trainer.checkpoint_every", "device", "compile", "threads", "run_dir", "logger", "budget",
+    "whole",
+)  # fmt: skip
 
 
 def require_same_run(path: Path, run: RunConfig) -> dict[str, Any]:

@@ -169,7 +169,7 @@ def test_a_block_at_the_tolerance_is_not_in_place(env):
         for block, goal in zip(blocks, goals, strict=True):
             block.set_qpos(goal - np.array([0.0, offset], np.float32))
         *_, info = env.step(np.array(STILL, np.float32))
-        assert info == {"success": expected == 2, "blocks_in_place": expected}
+        assert info == {"success": expected == 2, "blocks_in_place": expected, "score": expected / 2}
 
 
 def test_the_time_limit_truncates_and_never_terminates():
@@ -227,7 +227,7 @@ def test_any_number_of_blocks_starts_apart_and_inside(blocks):
     obs, info = env.reset()
     assert obs.shape == env.observation_space.shape == (8 * blocks + 6,)
     assert env.objects_of_interest.dim == 2 * blocks + 2
-    assert info == {"success": False, "blocks_in_place": 0}
+    assert info == {"success": False, "blocks_in_place": 0, "score": 0.0}
     place = np.concatenate([env.physics.position, env.physics.goals])
     assert np.abs(place).max() <= ARENA
     for i in range(blocks + 1):
@@ -332,7 +332,7 @@ def test_the_visual_task_is_solved_by_the_same_script():
     script.run()
     assert script.rewards[0] == 0.0
     assert script.rewards[-1] == 1.0
-    assert script.infos[-1] == {"success": True, "blocks_in_place": 1}
+    assert script.infos[-1] == {"success": True, "blocks_in_place": 1, "score": 1.0}
     env.close()
 
 

@@ -199,7 +199,8 @@ class _BlockPush(gymnasium.Env[NDArray[Any], Floats], ABC):
     def _info(self) -> dict[str, Any]:
         offset = self.physics.goals - self.physics.position[:-1]
         in_place = int((np.einsum("ij,ij->i", offset, offset) < TOLERANCE**2).sum())
-        return {"success": in_place == len(offset), "blocks_in_place": in_place}
+        count = len(offset)
+        return {"success": in_place == count, "blocks_in_place": in_place, "score": in_place / count}
 
     def _paint(self) -> Frame:
         if self._painter is None:
