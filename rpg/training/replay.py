@@ -141,15 +141,24 @@ class SegmentReplay:
                 so that a discovery is learned from while it is still news.
             recent_window: in transitions.
         """
+        return self._segments(*self._draw(batch_size, recent_fraction, recent_window), horizon)
+
+    def _draw(self, batch_size: int, recent_fraction: float, recent_window: int) -> tuple[Tensor, Tensor]:
+        """Where segments begin: age of the row (N,), 0 for the oldest, and environment (N,)."""
         if not self._filled:
             raise RPGError("replay is empty: add transitions before sampling")
         device = self._data.device
-        age = torch.randint(self._filled, (batch_size,), device=device)  # 0 is the oldest row
+        age = torch.randint(self._filled, (batch_size,), device=device)
         recent = round(batch_size * recent_fraction)
         if recent:
             window = min(self._filled, max(recent_window // self._num_envs, 1))
             age[:recent] = torch.randint(self._filled - window, self._filled, (recent,), device=device)
-        env = torch.randint(self._num_envs, (batch_size,), device=device)
+        return age, torch.randint(self._num_envs, (batch_size,), device=device)
+
+    def _segments(self, age: Tensor, env: Tensor, horizon: int) -> SegmentBatch:
+        """The segments of ``horizon`` steps that begin there."""
+        batch_size = len(age)
+        device = self._data.device
         steps = torch.arange(horizon, device=device).unsqueeze(1)
         ages = age + steps  # (K, N)
         oldest = self._head - self._filled
