@@ -39,7 +39,7 @@ def evaluate_run(run_dir: Path, episodes: int, seed: int, num_envs: int | None =
         RPGError: not a run folder, or a damaged checkpoint.
     """
     run, state = _load(run_dir)
-    envs = make_envs(run.env, num_envs or run.trainer.eval_envs)
+    envs = make_envs(run.env.for_evaluation(), num_envs or run.trainer.eval_envs)
     agent = _agent(run, state, envs)
     result: dict[str, float] = {}
     for mode, deterministic, planning in agent.evaluations:
@@ -56,7 +56,7 @@ def film_run(run_dir: Path, path: Path, episodes: int, seed: int, deterministic:
         RPGError: not a run folder, a damaged checkpoint, or an environment that draws nothing.
     """
     run, state = _load(run_dir)
-    with closing(make_envs(run.env, 1, render=True)) as envs:
+    with closing(make_envs(run.env.for_evaluation(), 1, render=True)) as envs:
         agent = _agent(run, state, envs)
         film(agent, envs, path, episodes, seed, deterministic, run.env.name)
 

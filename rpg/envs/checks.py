@@ -69,3 +69,56 @@ def checked_action(name: str, action: ArrayLike, dim: int) -> NDArray[Any]:
         )
     clipped: NDArray[Any] = values.clip(-1.0, 1.0)
     return clipped
+
+
+def checked_actions(
+    name: str, actions: ArrayLike, shape: tuple[int, ...], elapsed: NDArray[Any]
+) -> NDArray[Any]:
+    """Continuous ``actions`` of a batch as float64.
+
+    Args:
+        name: of the environment, for messages.
+        actions: what the agent sent.
+        shape: (num_envs, action_dim) that they must have.
+        elapsed: (num_envs,) steps since the start of each episode, for messages.
+
+    Raises:
+        RPGError: another shape.
+        NonFiniteError: NaN or infinite entries.
+    """
+    values = np.asarray(actions, dtype=np.float64)
+    if values.shape != shape:
+        raise RPGError(f"{name} step: actions have shape {values.shape}, expected {shape}")
+    if not np.isfinite(values).all():
+        env = int(np.flatnonzero(~np.isfinite(values).all(axis=1))[0])
+        raise NonFiniteError(
+            f"{name}: action {values[env].tolist()} of environment {env} at step {elapsed[env]} of its episode "
+            "is not finite; look at the policy that produced it"
+        )
+    return values
+
+
+def checked_choices(name: str, actions: ArrayLike, num_envs: int, count: int) -> NDArray[np.int64]:
+    """Discrete ``actions`` of a batch, (num_envs,) int64.
+
+    Args:
+        name: of the environment, for messages.
+        actions: what the agent sent.
+        num_envs: how many there must be.
+        count: actions are whole numbers from 0 to ``count - 1``.
+
+    Raises:
+        RPGError: another shape, numbers that are not whole, or an action that there is not.
+    """
+    values = np.asarray(actions)
+    if values.shape != (num_envs,) or not np.issubdtype(values.dtype, np.integer):
+        raise RPGError(
+            f"{name} step: actions are {values.dtype} of shape {values.shape}, expected whole numbers of shape "
+            f"({num_envs},)"
+        )
+    wrong = np.flatnonzero((values < 0) | (values >= count))
+    if wrong.size:
+        raise RPGError(
+            f"{name} step: action {values[wrong[0]]} of environment {wrong[0]} must be one of 0 to {count - 1}"
+        )
+    return values.astype(np.int64)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from rpg.errors import RPGError
@@ -17,6 +17,7 @@ class EnvConfig:
         id: the registered gymnasium id.
         module: imported first, if the id is registered by a module of another package.
         kwargs: passed to its constructor.
+        eval_kwargs: merged over ``kwargs`` for evaluation and films, where tests are made otherwise than training.
         num_envs: sub-environments of the training batch.
         asynchronous: step each sub-environment in a process of its own (no effect on batched ones).
         action_repeat: simulator steps per decision. Environments of this package make them in one ``step``;
@@ -33,6 +34,7 @@ class EnvConfig:
     id: str = "rpg/GapMaze-v1"
     module: str | None = None
     kwargs: dict[str, Any] = field(default_factory=dict)
+    eval_kwargs: dict[str, Any] = field(default_factory=dict)
     num_envs: int = 5
     asynchronous: bool = False
     action_repeat: int = 1
@@ -46,3 +48,7 @@ class EnvConfig:
         for name in ("num_envs", "action_repeat", "frame_stack"):
             if getattr(self, name) < 1:
                 raise RPGError(f"env.{name}={getattr(self, name)}: must be at least 1")
+
+    def for_evaluation(self) -> EnvConfig:
+        """The environment that agents are tested in: ``eval_kwargs`` merged over ``kwargs``."""
+        return replace(self, kwargs=self.kwargs | self.eval_kwargs)

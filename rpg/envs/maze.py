@@ -11,12 +11,12 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from rpg.envs.checks import checked_render_mode, checked_reset_mask
+from rpg.envs.checks import checked_actions, checked_render_mode, checked_reset_mask
 from rpg.envs.layouts import LAYOUTS, MazeLayout
-from rpg.envs.maze_picture import Frame, MazeCanvas
+from rpg.envs.maze_picture import GOAL, Frame, MazeCanvas
 from rpg.envs.maze_tracker import MazeTracker
 from rpg.envs.single import SingleEnv
-from rpg.errors import NonFiniteError, RPGError, nearest
+from rpg.errors import RPGError, nearest
 from rpg.exploration.objects import ObjectsOfInterest
 
 Array = NDArray[Any]
@@ -172,15 +172,8 @@ class MazeVectorEnv(VectorEnv[Array, Array, Array]):
             NonFiniteError: an action is NaN or infinite.
             RPGError: ``actions`` has another shape.
         """
-        actions = np.asarray(actions, dtype=np.float64)
-        if actions.shape != self._position.shape:
-            raise RPGError(f"maze step: actions have shape {actions.shape}, expected {self._position.shape}")
-        if not np.isfinite(actions).all():
-            env = int(np.flatnonzero(~np.isfinite(actions).all(axis=1))[0])
-            raise NonFiniteError(
-                f"maze '{self.layout.name}': action {actions[env].tolist()} of environment {env} at step "
-                f"{self._elapsed[env]} of its episode is not finite; look at the policy that produced it"
-            )
+        name = f"maze '{self.layout.name}'"
+        actions = checked_actions(name, actions, self._position.shape, self._elapsed)
         self._position = self._walls.move(self._position, actions.clip(-1.0, 1.0) * self.layout.action_scale)
         self._elapsed += 1
         terminated = np.zeros(self.num_envs, dtype=np.bool_)
@@ -216,7 +209,8 @@ class MazeVectorEnv(VectorEnv[Array, Array, Array]):
         if self.render_mode is None:
             return None
         if self._canvas is None:
-            self._canvas = MazeCanvas(self.layout, self.goal, self.goal_radius)
+            discs = [] if self.goal is None else [(GOAL, self.goal, self.goal_radius)]
+            self._canvas = MazeCanvas(self.layout.walls, self.layout.half_size, discs=discs)
         return tuple(self._canvas.frame(point) for point in self._position)
 
 

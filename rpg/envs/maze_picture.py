@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,8 @@ from rpg.envs.layouts import MazeLayout
 Floats = NDArray[np.float64]
 Frame = NDArray[np.uint8]
 Colour = tuple[float, float, float]
+Disc = tuple[Colour, Floats, float]
+"""Colour, centre (2,) and radius, in maze units."""
 
 PIXELS = 256  # side of a frame
 MARGIN = 1.03  # a frame shows this many half sizes, so the boundary is seen whole
@@ -19,39 +22,51 @@ PAPER: Colour = (250.0, 250.0, 250.0)
 WALL: Colour = (45.0, 52.0, 64.0)
 GOAL: Colour = (178.0, 223.0, 138.0)
 POINT: Colour = (214.0, 69.0, 65.0)
+OTHER: Colour = (66.0, 122.0, 196.0)
 
 
 class MazeCanvas:
-    """Frames of one maze; walls and goal are drawn once, y up.
+    """Frames of one maze; walls and what does not change are drawn once, y up.
 
     Args:
-        layout: the maze.
-        goal: (2,) maze units, or None.
-        goal_radius: maze units.
+        walls: (n, 4) rows ``x0, y0, x1, y1``, maze units.
+        half_size: the picture shows so much to each side of the centre, and a little more.
+        centre: (2,) maze units.
+        discs: what lies in every frame.
     """
 
-    def __init__(self, layout: MazeLayout, goal: Floats | None, goal_radius: float) -> None:
-        extent = layout.half_size * MARGIN
+    def __init__(
+        self,
+        walls: Floats,
+        half_size: float,
+        centre: tuple[float, float] = (0.0, 0.0),
+        discs: Iterable[Disc] = (),
+    ) -> None:
+        extent = half_size * MARGIN
         self.pixel = 2 * extent / PIXELS
         centres = (np.arange(PIXELS) + 0.5) * self.pixel - extent
-        self.x, self.y = centres[None, :], -centres[:, None]  # (1, P) and (P, 1)
+        self.x, self.y = centre[0] + centres[None, :], centre[1] - centres[:, None]  # (1, P) and (P, 1)
         squared = np.full((PIXELS, PIXELS), np.inf)  # distance to the nearest wall
-        for x0, y0, x1, y1 in layout.walls:
+        for x0, y0, x1, y1 in walls:
             dx = np.maximum(np.maximum(min(x0, x1) - self.x, self.x - max(x0, x1)), 0.0)
             dy = np.maximum(np.maximum(min(y0, y1) - self.y, self.y - max(y0, y1)), 0.0)
             np.minimum(squared, dx * dx + dy * dy, out=squared)
         self.background = np.empty((PIXELS, PIXELS, 3))
         self.background[:] = PAPER
-        if goal is not None:
-            self._blend(self.background, GOAL, goal_radius - self._distance(goal))
+        self._lay(self.background, discs)
         self._blend(self.background, WALL, self.pixel - np.sqrt(squared))
 
-    def frame(self, point: Floats) -> Frame:
-        """The maze with a point (2,) in it: uint8 (256, 256, 3) RGB."""
+    def frame(self, point: Floats, discs: Iterable[Disc] = ()) -> Frame:
+        """The maze with a point (2,) in it, over ``discs``: uint8 (256, 256, 3) RGB."""
         image = self.background.copy()
+        self._lay(image, discs)
         self._blend(image, POINT, 4.5 * self.pixel - self._distance(point))
         frame: Frame = image.round().astype(np.uint8)
         return frame
+
+    def _lay(self, image: Floats, discs: Iterable[Disc]) -> None:
+        for colour, place, radius in discs:
+            self._blend(image, colour, radius - self._distance(place))
 
     def _distance(self, place: Floats) -> Floats:
         distance: Floats = np.hypot(self.x - place[0], self.y - place[1])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gymnasium
 
 from rpg.envs.bandit import register_bandit
+from rpg.envs.goal_registration import register_goals
 from rpg.envs.mujoco.registration import register_mujoco
 from rpg.envs.plasticine_registration import register_plasticine
 from rpg.envs.sapien.registration import register_sapien
@@ -30,6 +31,7 @@ MAZES = {
 def register_all() -> None:
     """Register every environment with gymnasium; safe to call again. Nothing heavy is imported."""
     register_bandit()
+    register_goals()
     register_mujoco()
     register_plasticine()
     register_sapien()

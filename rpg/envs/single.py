@@ -29,9 +29,12 @@ class SingleEnv(gymnasium.Env[Array, Array]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Array, dict[str, Any]]:
-        """Start the next episode."""
+        """Start the next episode; options as the batch takes them, without its dimension."""
         super().reset(seed=seed)
-        observations, info = self._batch.reset()
+        observations, info = self._batch.reset(
+            seed=None if seed is None else [seed],
+            options=None if options is None else {key: [value] for key, value in options.items()},
+        )
         return observations[0], info
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:

@@ -210,7 +210,7 @@ def build_trainer(run: RunConfig) -> Trainer:
         agent=agent,
         exploration=build_exploration(run, agent, objects),
         envs=envs,
-        eval_envs=lambda: make_envs(run.env, run.trainer.eval_envs),
+        eval_envs=lambda: make_envs(run.env.for_evaluation(), run.trainer.eval_envs),
         config=run.trainer,
         run_dir=run_dir,
         loggers=Loggers(run_dir, _sinks(run, run_dir)),
@@ -218,7 +218,7 @@ def build_trainer(run: RunConfig) -> Trainer:
         plain_config=run.plain,
         env_name=run.env.name,
         action_repeat=run.env.action_repeat,
-        film_envs=lambda: make_envs(run.env, 1, render=True),
+        film_envs=lambda: make_envs(run.env.for_evaluation(), 1, render=True),
     )
     if run.compile:
         trainer.compile()

@@ -10,6 +10,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rpg.envs.grids import boundaries
 from rpg.errors import RPGError
 
 Floats = NDArray[np.float64]
@@ -121,6 +122,14 @@ class CellMap:
         corners = self.centres([(rows - 1, 0), (0, columns - 1)])
         return corners[0] - self.cell / 2, corners[1] + self.cell / 2
 
+    @cached_property
+    def wall_segments(self) -> Floats:
+        """Sides of walls, (n, 4) rows ``x0, y0, x1, y1``."""
+        low, high = self.bounds
+        corner = np.array([low[0], high[1]])
+        ends = boundaries(~self.walls).reshape(-1, 2, 2) * np.array([self.cell, -self.cell])
+        return (corner + ends).reshape(-1, 4)
+
     def is_free(self, points: ArrayLike, clearance: float = 0.0) -> Mask:
         """Which points lie on free cells, with a square around them.
 
@@ -181,17 +190,39 @@ def rectangles(mask: Mask) -> list[tuple[int, int, int, int]]:
     return found
 
 
+U_ROWS = ("#####", "#...#", "###.#", "#R..#", "#####")
+"""A corridor bent to a U that opens to the left."""
+
 MAPS: dict[str, CellMap] = {
     "push": CellMap(
         ("#####", "##.##", "#.B.#", "#.R##", "#####"),
         blocks={"B": "xy"},
         goal=(0.0, 19.0),
     ),
-    "maze": CellMap(("#####", "#...#", "###.#", "#R..#", "#####"), goal=(0.0, 16.0)),
+    "maze": CellMap(U_ROWS, goal=(0.0, 16.0)),
+    "maze_small": CellMap(U_ROWS, cell=4.0, wall_height=2.0, goal=(0.0, 8.0)),
+    "maze_complex": CellMap(
+        (
+            "#########",
+            "#.#.#...#",
+            "#.....#.#",
+            "#.#.#.###",
+            "#.###..##",
+            "#...##.##",
+            "###.#...#",
+            "#R..#...#",
+            "#########",
+        ),
+        goal=(48.0, 0.0),
+    ),
     "fall": CellMap(
         ("####", "#..#", "#~~#", "#.B#", "#R.#", "####"),
         blocks={"B": "yz"},
         goal=(0.0, 27.0, 4.5),
     ),
 }
-"""Maps of Nachum et al. 2018 (HIRO): AntPush, AntMaze, AntFall."""
+"""Maps of Nachum et al. 2018 (HIRO): AntPush, AntMaze, AntFall; and two more mazes of thesis Ch. 4.
+
+``maze_small`` is AntMaze at half the size. The map of the 56x56 maze was not published: ``maze_complex`` is that of
+later papers on landmarks, which has this size; its goal is one of the two cells farthest from the start.
+"""
