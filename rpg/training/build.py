@@ -236,7 +236,8 @@ def _sinks(run: RunConfig, run_dir: Path) -> list[Sink]:
 
 # Settings that may change between restarts without making it another run.
 _FREE = (
-    "trainer.steps", "trainer.stop_at_success", "trainer.checkpoint_every", "device", "compile", "threads", "run_dir", "logger",
+    "trainer.steps", "trainer.stop_at_success", "trainer.checkpoint_every", "device", "compile", "threads",
+    "run_dir", "logger",
 )  # fmt: skip
 
 

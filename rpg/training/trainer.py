@@ -20,9 +20,9 @@ from rpg.errors import NonFiniteError
 from rpg.exploration import ExplorationBonus
 from rpg.training.checkpoint import load_checkpoint, save_checkpoint
 from rpg.training.config import TrainerConfig
-from rpg.training.loggers import Loggers
 from rpg.training.distances import distance_errors
 from rpg.training.hindsight import make_replay
+from rpg.training.loggers import Loggers
 from rpg.training.runner import Episode, Runner, evaluate, summarize
 from rpg.training.video import film
 
@@ -276,6 +276,10 @@ class Trainer:
         row |= distance_errors(self.agent, self._eval_envs)
         self._loggers.log(row, self.env_steps)
         self._last_row = self._last_row | row
+        self._judge(row)
+
+    def _judge(self, row: Row) -> None:
+        """Count evaluations in a row that reach ``stop_at_success``."""
         if self.config.stop_at_success is not None:
             success = float(row[f"eval/{self.agent.evaluations[0].name}/success_end"])
             self._successes = self._successes + 1 if success >= self.config.stop_at_success else 0
