@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rpg.envs.goal_batch import RANDOM
 from rpg.envs.maze import Walls
 from rpg.envs.maze_picture import MazeCanvas
 from rpg.envs.mujoco.cell_map import CellMap
 from rpg.envs.streams import Floats, Integers, Mask, Streams
 from rpg.errors import RPGError
 
-RANDOM = "random"
 Place = str | Sequence[float] | NDArray[Any]
 """A place, (x, y), or :data:`RANDOM`."""
 

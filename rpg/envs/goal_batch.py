@@ -22,6 +22,9 @@ from rpg.goals import GoalSpec
 
 Array = NDArray[Any]
 
+RANDOM = "random"
+"""Instead of a place: another one in each episode."""
+
 REWARDS = ("sparse", "dense")
 
 
@@ -34,6 +37,17 @@ def checked_reward(name: str, reward: str) -> str:
     if reward not in REWARDS:
         raise RPGError(f"{name}: reward '{reward}' is unknown; use {' or '.join(map(repr, REWARDS))}")
     return reward
+
+
+def checked_horizon(name: str, episode_steps: int) -> int:
+    """``episode_steps`` as it was given.
+
+    Raises:
+        RPGError: it is below 1.
+    """
+    if episode_steps < 1:
+        raise RPGError(f"{name}: episode_steps {episode_steps} must be at least 1")
+    return episode_steps
 
 
 def goal_reward(spec: GoalSpec, reward: str, observations: Array) -> tuple[Floats, Floats]:
@@ -93,11 +107,10 @@ class GoalVectorEnv(VectorEnv[Array, Array, Array], ABC):
         render_mode: str | None,
         internal_dim: int | None = None,
     ) -> None:
-        if num_envs < 1 or episode_steps < 1:
-            raise RPGError(
-                f"{self.name}: num_envs {num_envs} and episode_steps {episode_steps} must be at least 1"
-            )
-        self.num_envs, self.goal_spec, self.episode_steps = num_envs, spec, episode_steps
+        if num_envs < 1:
+            raise RPGError(f"{self.name}: num_envs {num_envs} must be at least 1")
+        self.num_envs, self.goal_spec = num_envs, spec
+        self.episode_steps = checked_horizon(self.name, episode_steps)
         self.reward = checked_reward(self.name, reward)
         self.render_mode = checked_render_mode(self.name, render_mode)
         low, high = state_low.astype(np.float32), state_high.astype(np.float32)

@@ -7,8 +7,7 @@ from typing import Any, ClassVar
 import numpy as np
 from gymnasium.spaces import Discrete
 
-from rpg.envs.arena import RANDOM
-from rpg.envs.goal_batch import GoalVectorEnv, SingleGoalEnv
+from rpg.envs.goal_batch import RANDOM, GoalVectorEnv, SingleGoalEnv
 from rpg.envs.grids import MOVES, boundaries, distances, steps
 from rpg.envs.maze_picture import GOAL, Disc, MazeCanvas
 from rpg.envs.streams import Floats, Integers, Mask

@@ -7,8 +7,8 @@ from typing import Any, ClassVar
 import numpy as np
 from gymnasium.spaces import Box
 
-from rpg.envs.arena import RANDOM, Arena, Place
-from rpg.envs.goal_batch import GoalVectorEnv, SingleGoalEnv
+from rpg.envs.arena import Arena, Place
+from rpg.envs.goal_batch import RANDOM, GoalVectorEnv, SingleGoalEnv
 from rpg.envs.maze_picture import GOAL, OTHER, Disc, MazeCanvas
 from rpg.envs.mujoco.cell_map import U_ROWS, CellMap
 from rpg.envs.streams import Floats, Integers

@@ -6,8 +6,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from rpg.envs.arena import RANDOM, Arena, Place
-from rpg.envs.goal_batch import SingleGoalEnv
+from rpg.envs.arena import Arena, Place
+from rpg.envs.goal_batch import RANDOM, SingleGoalEnv
 from rpg.envs.goal_plane import PlaneVectorEnv
 from rpg.envs.mujoco.cell_map import MAPS, CellMap
 from rpg.envs.streams import Floats, Integers

@@ -22,7 +22,7 @@ register_mujoco()
 PRESETS = {
     "ant_push": (33, 4),
     "ant_push_sparse": (33, 4),
-    "ant_maze": (30, 2),
+    "ant_maze_fixed": (30, 2),
     "ant_fall": (33, 4),
     "cheetah_back": (18, 3),
     "mujoco_half_cheetah": (17, 2),

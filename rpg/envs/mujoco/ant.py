@@ -18,9 +18,9 @@ ANT_QPOS, ANT_QVEL = 15, 14
 CLEARANCE = 1.0
 """Half the side of the square that a standing ant needs, noise of the start included."""
 
-_FRAME_SKIP = 5
+FRAME_SKIP = 5
 _REWARD_SCALE = 0.1
-_TIME_SCALE = 0.001
+TIME_SCALE = 0.001
 _NOISE = 0.1
 _XY_SCALE, _REST_SCALE = 0.01, 0.1  # of a scaled observation
 
@@ -81,7 +81,7 @@ class AntMapEnv(MujocoTask):
             )
         blocks = len(cell_map.block_cells)
         obs_dim = ANT_QPOS + ANT_QVEL + 1 + 3 * blocks
-        super().__init__(name, ant_scene(cell_map), _FRAME_SKIP, obs_dim, render_mode, camera, render_size)
+        super().__init__(name, ant_scene(cell_map), FRAME_SKIP, obs_dim, render_mode, camera, render_size)
 
         self.cell_map = cell_map
         self.success_distance = success_distance
@@ -111,15 +111,8 @@ class AntMapEnv(MujocoTask):
         if "goal" in options:
             self._take_goal(options["goal"])
         if "start" in options:
-            start = _numbers(self._name, "start", options["start"], (2,))
-            if not self.cell_map.is_free(start, CLEARANCE):
-                raise RPGError(
-                    f"{self._name}: start {start} has less than {CLEARANCE} of free floor around it"
-                )
-            self._qpos[:2] = start
-        self._qpos[:ANT_QPOS] += self.np_random.uniform(-_NOISE, _NOISE, ANT_QPOS)
-        self._qpos[3:7] /= np.linalg.norm(self._qpos[3:7])
-        self._qvel[:ANT_QVEL] = _NOISE * self.np_random.standard_normal(ANT_QVEL)
+            self._qpos[:2] = checked_start(self._name, self.cell_map, options["start"])
+        disturb(self._qpos, self._qvel, self.np_random)
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         """Drive the motors for 0.1 s; ``action`` (8,).
@@ -139,7 +132,7 @@ class AntMapEnv(MujocoTask):
         buffer, ant = self._buffer, ANT_QPOS + ANT_QVEL
         buffer[:ANT_QPOS] = self._qpos[:ANT_QPOS]
         buffer[ANT_QPOS:ant] = self._qvel[:ANT_QVEL]
-        buffer[ant] = _TIME_SCALE * self._elapsed
+        buffer[ant] = TIME_SCALE * self._elapsed
         if self._moved.size:
             blocks = buffer[ant + 1 :]
             blocks[:] = self._home
@@ -160,7 +153,7 @@ class AntMapEnv(MujocoTask):
     def _take_goal(self, goal: Sequence[float] | None) -> None:
         if goal is None:
             raise RPGError(f"{self._name}: this map has no goal of its own; give goal=(x, y)")
-        place = _numbers(self._name, "goal", goal, (2, 3))
+        place = numbers(self._name, "goal", goal, (2, 3))
         if self.cell_map.character_at(place[:2]) == WALL:
             raise RPGError(f"{self._name}: goal {place} lies in a wall or outside the map")
         self._goal = place
@@ -168,11 +161,35 @@ class AntMapEnv(MujocoTask):
         self.model.site_pos[self._site] = (*place[:2], height)
 
 
-def _numbers(name: str, what: str, value: Any, counts: tuple[int, ...]) -> tuple[float, ...]:
+def disturb(qpos: Array, qvel: Array, rng: np.random.Generator) -> None:
+    """Add the published noise to an ant's position (15,) and set its velocity (14,) to some, in place."""
+    qpos[:ANT_QPOS] += rng.uniform(-_NOISE, _NOISE, ANT_QPOS)
+    qpos[3:7] /= np.linalg.norm(qpos[3:7])
+    qvel[:ANT_QVEL] = _NOISE * rng.standard_normal(ANT_QVEL)
+
+
+def checked_start(name: str, cell_map: CellMap, value: Any) -> tuple[float, ...]:
+    """A place (x, y) where an ant has room.
+
+    Raises:
+        RPGError: it has not.
+    """
+    start = numbers(name, "start", value, (2,))
+    if not cell_map.is_free(start, CLEARANCE):
+        raise RPGError(f"{name}: start {start} has less than {CLEARANCE} of free floor around it")
+    return start
+
+
+def numbers(name: str, what: str, value: Any, counts: tuple[int, ...]) -> tuple[float, ...]:
+    """``value`` as floats.
+
+    Raises:
+        RPGError: not as many finite numbers as one of ``counts``.
+    """
     try:
-        numbers = tuple(float(v) for v in value)
+        given = tuple(float(v) for v in value)
     except (TypeError, ValueError):
-        numbers = ()
-    if len(numbers) not in counts or not all(map(math.isfinite, numbers)):
+        given = ()
+    if len(given) not in counts or not all(map(math.isfinite, given)):
         raise RPGError(f"{name}: {what} {value!r} must be {' or '.join(map(str, counts))} finite numbers")
-    return numbers
+    return given
