@@ -23,6 +23,7 @@ from rpg.training.config import TrainerConfig
 from rpg.training.distances import distance_errors
 from rpg.training.hindsight import make_replay
 from rpg.training.loggers import Loggers
+from rpg.training.map_picture import map_picture
 from rpg.training.runner import Episode, Runner, evaluate, summarize
 from rpg.training.video import film
 
@@ -259,13 +260,12 @@ class Trainer:
         return row
 
     def _evaluate(self) -> None:
-        if self._eval_envs is None:
-            self._eval_envs = self._make_eval_envs()
+        envs = self._evaluation_envs()
         row = self._progress()
         for mode, deterministic, planning in self.agent.evaluations:
             episodes = evaluate(
                 self.agent,
-                self._eval_envs,
+                envs,
                 self.config.eval_episodes,
                 self._seed + _EVALUATION_SEED,
                 deterministic,
@@ -273,10 +273,15 @@ class Trainer:
                 planning,
             )
             row |= summarize(episodes, f"eval/{mode}")
-        row |= distance_errors(self.agent, self._eval_envs)
+        row |= distance_errors(self.agent, envs)
         self._loggers.log(row, self.env_steps)
         self._last_row = self._last_row | row
         self._judge(row)
+
+    def _evaluation_envs(self) -> VectorEnv[Any, Any, Any]:
+        if self._eval_envs is None:
+            self._eval_envs = self._make_eval_envs()
+        return self._eval_envs
 
     def _judge(self, row: Row) -> None:
         """Count evaluations in a row that reach ``stop_at_success``."""
@@ -285,10 +290,14 @@ class Trainer:
             self._successes = self._successes + 1 if success >= self.config.stop_at_success else 0
 
     def draw(self) -> None:
-        """Write the tracker's picture of progress, if it has one."""
+        """Write the tracker's picture of progress and that of the agent's map, if there are such."""
         picture = self._tracker.picture() if self._tracker is not None else None
         if picture is not None:
             self._loggers.picture("progress", picture, self.env_steps)
+        if self.agent.hindsight is not None:
+            chart = map_picture(self.agent, self._evaluation_envs(), self._seed + _EVALUATION_SEED)
+            if chart is not None:
+                self._loggers.picture("map", chart, self.env_steps)
 
     def film(self) -> None:
         """Write a video of an evaluation episode into the run folder, if there is an environment for it."""

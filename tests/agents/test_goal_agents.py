@@ -10,7 +10,6 @@ import pytest
 import torch
 from gymnasium.spaces import Box, Discrete
 from point import snapshot, touched
-from rpg.landmarks.config import PlannerConfig
 from torch import Tensor
 
 from rpg.agents import GoalDDPG, GoalDDPGConfig, GoalDQN, GoalDQNConfig, HindsightConfig
@@ -18,6 +17,7 @@ from rpg.agents.distance import value_of, value_target
 from rpg.agents.goal import GoalAgent
 from rpg.errors import RPGError
 from rpg.goals import GoalSpec
+from rpg.landmarks.config import PlannerConfig
 from rpg.segments import SegmentBatch
 from rpg.training.hindsight import HindsightReplay, make_replay
 
@@ -47,7 +47,8 @@ def moved(agent: GoalAgent, state: Tensor, action: Tensor) -> Tensor:
 
 
 def begin(n: int) -> Tensor:
-    return torch.cat([torch.zeros(n, 1), torch.rand(n, 2) * 2 - 1], dim=1)
+    """Starts and goals that whole steps of 0.2 lead to."""
+    return torch.cat([torch.zeros(n, 1), torch.randint(-5, 6, (n, 2)) / 5], dim=1)
 
 
 def practise(agent: GoalAgent, vector_steps: int) -> HindsightReplay:
@@ -106,20 +107,20 @@ BOTH = pytest.mark.parametrize("kind", ["ddpg", "dqn"])
 def test_learns_to_reach_any_goal_and_how_far_it_is(kind: str) -> None:
     agent = make(kind, arrival_ends=True, gamma=0.95)
     practise(agent, 500)
-    places = torch.linspace(-0.9, 0.9, 12)
+    places = torch.arange(-5, 6) / 5
     start, goal = torch.meshgrid(places, places, indexing="ij")
-    obs = torch.stack([torch.zeros(144), start.ravel(), goal.ravel()], dim=1)
+    obs = torch.stack([torch.zeros(121), start.ravel(), goal.ravel()], dim=1)
     way = (obs[:, 1] - obs[:, 2]).abs()
     far = agent.distance(obs[:, :2], obs[:, 2:])
     assert np.corrcoef(far, way)[0, 1] > 0.9
     assert (far >= 0).all()
-    least = (way / 0.2).ceil()
+    least = (way / 0.2).round()
     assert ((far - least).abs() < 2.0).float().mean() > 0.8
     with agent.evaluating():
         for _ in range(STEPS):
-            action = agent.act(obs, torch.zeros(144, 0), deterministic=True)
+            action = agent.act(obs, torch.zeros(121, 0), deterministic=True)
             obs = torch.cat([moved(agent, obs[:, :2], action), obs[:, 2:]], dim=1)
-    assert ((obs[:, 1] - obs[:, 2]).abs() <= 0.2).float().mean() > 0.9
+    assert ((obs[:, 1] - obs[:, 2]).abs() <= 0.11).float().mean() > 0.9
 
 
 # -- values --------------------------------------------------------------------------------------------
@@ -381,7 +382,7 @@ def test_plans_over_a_real_map_after_practice(kind: str) -> None:
         for _ in range(STEPS + 5):
             action = agent.act(obs, torch.zeros(32, 0), deterministic=True)
             obs = torch.cat([moved(agent, obs[:, :2], action), obs[:, 2:]], dim=1)
-    assert ((obs[:, 1] - obs[:, 2]).abs() <= 0.2).float().mean() > 0.8
+    assert ((obs[:, 1] - obs[:, 2]).abs() <= 0.11).float().mean() > 0.8
     found = agent.distances(obs)
     assert found.keys() == {"her", "planner"}
     assert all((steps >= 0).all() for steps in found.values())

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from omegaconf import DictConfig
-from test_resume import assert_equal_runs, interrupt
+from resuming import assert_equal_runs, interrupt
 
 from rpg.envs.goal_grid import FourRoomVectorEnv
 from rpg.errors import RPGError
