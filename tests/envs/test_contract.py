@@ -25,7 +25,8 @@ from rpg.training.build import env_preset
 
 PACKAGES = {  # of presets, by how their name begins
     "ant": "mujoco", "cheetah": "mujoco", "mujoco": "mujoco", "adroit": "gymnasium_robotics",
-    "gymnasium_robotics": "gymnasium_robotics", "metaworld": "metaworld", "blocked": "gymnasium_robotics", "block": "sapien", "visual": "sapien",
+    "gymnasium_robotics": "gymnasium_robotics", "metaworld": "metaworld", "blocked": "gymnasium_robotics",
+    "block": "sapien", "visual": "sapien",
     "cabinet": "mani_skill", "fetch": "gymnasium_robotics", "maniskill": "mani_skill", "plasticine": "numba",
 }  # fmt: skip
 PRESETS = sorted(path.stem for path in (Path(rpg.conf.__file__).parent / "env").glob("*.yaml"))

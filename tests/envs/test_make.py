@@ -126,3 +126,14 @@ def test_a_module_registers_its_ids_first(tmp_path: Any, monkeypatch: pytest.Mon
     del gym.registry["Outside-v0"], sys.modules["outside_envs"]
     with pytest.raises(RPGError, match="'no_such_module'.*pip install no_such_module"):
         make_envs(EnvConfig(id="Outside-v0", module="no_such_module", num_envs=1))
+
+
+def test_evaluation_settings_are_merged_over_the_others() -> None:
+    config = EnvConfig(id="rpg/Reach2D-v0", kwargs={"episode_steps": 9, "reward": "dense"})
+    config.eval_kwargs = {"episode_steps": 4, "goal": [2.5, 12.5]}
+    tested = config.for_evaluation()
+    assert tested.kwargs == {"episode_steps": 4, "reward": "dense", "goal": [2.5, 12.5]}
+    assert config.kwargs == {"episode_steps": 9, "reward": "dense"}
+    for chosen, steps in ((config, 9), (tested, 4)):
+        envs: Any = make_envs(chosen, 1)
+        assert envs.episode_steps == steps
