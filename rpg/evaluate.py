@@ -13,34 +13,37 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+from gymnasium.vector import VectorEnv
 from omegaconf import OmegaConf
 
+from rpg.agents.agent import Agent
 from rpg.cli import report_errors
 from rpg.envs.make import make_envs
 from rpg.errors import RPGError
 from rpg.training.build import build_agent, parse_config
 from rpg.training.checkpoint import load_checkpoint
 from rpg.training.config import RunConfig
+from rpg.training.hindsight import stored_replay
 from rpg.training.runner import evaluate, summarize
 from rpg.training.video import film
 
 
 def evaluate_run(run_dir: Path, episodes: int, seed: int, num_envs: int | None = None) -> dict[str, float]:
-    """Load the checkpoint of ``run_dir`` and run whole episodes, with modes and with samples of pi(a|s, z).
+    """Load the checkpoint of ``run_dir`` and run whole episodes in every mode that its agent is judged in.
 
     Returns:
-        ``eval/deterministic/...`` and ``eval/stochastic/...`` means.
+        Means under ``eval/<mode>/``: ``deterministic`` and ``stochastic``, the mode and samples of pi(a|s, z);
+        of a goal-conditioned agent ``her`` and, if it has one, ``planner``.
 
     Raises:
         RPGError: not a run folder, or a damaged checkpoint.
     """
     run, state = _load(run_dir)
     envs = make_envs(run.env.for_evaluation(), num_envs or run.trainer.eval_envs)
-    agent, _ = build_agent(run, envs)
-    agent.load_state_dict(state["agent"])
+    agent = _agent(run, state, envs)
     result: dict[str, float] = {}
-    for mode, deterministic in (("deterministic", True), ("stochastic", False)):
-        finished = evaluate(agent, envs, episodes, seed, deterministic, run.env.name)
+    for mode, deterministic, planning in agent.evaluations:
+        finished = evaluate(agent, envs, episodes, seed, deterministic, run.env.name, planning)
         result |= summarize(finished, f"eval/{mode}")
     envs.close()
     return result
@@ -54,9 +57,17 @@ def film_run(run_dir: Path, path: Path, episodes: int, seed: int, deterministic:
     """
     run, state = _load(run_dir)
     with closing(make_envs(run.env.for_evaluation(), 1, render=True)) as envs:
-        agent, _ = build_agent(run, envs)
-        agent.load_state_dict(state["agent"])
+        agent = _agent(run, state, envs)
         film(agent, envs, path, episodes, seed, deterministic, run.env.name)
+
+
+def _agent(run: RunConfig, state: dict[str, Any], envs: VectorEnv[Any, Any, Any]) -> Agent:
+    """The trained agent, connected to what it learned from if it is judged with that."""
+    agent, _ = build_agent(run, envs)
+    agent.load_state_dict(state["agent"])
+    if run.planner is not None:
+        agent.connect(stored_replay(agent, state["replay"]))
+    return agent
 
 
 def _load(run_dir: Path) -> tuple[RunConfig, dict[str, Any]]:

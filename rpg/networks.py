@@ -38,17 +38,23 @@ def _orthogonal(module: nn.Module) -> None:
 class EnsembleMLP(nn.Module):
     """Independent MLPs of equal shape evaluated as one batched product: (..., in_dim) -> (members, ..., out_dim).
 
-    Same layers and initialisation as :func:`mlp`.
+    Same layers and initialisation as :func:`mlp`. Weights and biases are ``w1``, ``b1`` and so on.
 
     Args:
         in_dim: width of the input, which all members share.
-        width: of the two hidden layers.
+        width: of the hidden layers.
         out_dim: width of a member's output.
         members: how many.
         activation: see :data:`ACTIVATIONS`.
         normalize: replace the first activation by layer normalisation and tanh, so that no input is too
             large for the layers behind.
+        hidden: layers between input and output.
     """
+
+    w1: Tensor
+    b1: Tensor
+    w3: Tensor
+    b3: Tensor
 
     def __init__(
         self,
@@ -58,18 +64,23 @@ class EnsembleMLP(nn.Module):
         members: int,
         activation: str = "elu",
         normalize: bool = False,
+        hidden: int = 2,
     ) -> None:
         super().__init__()
         self.members = members
         self.act = ACTIVATIONS[activation]()
-        nets = [[m for m in mlp(in_dim, width, out_dim) if isinstance(m, nn.Linear)] for _ in range(members)]
+        nets = [
+            [m for m in mlp(in_dim, width, out_dim, hidden=hidden) if isinstance(m, nn.Linear)]
+            for _ in range(members)
+        ]
         # All first layers read the same input, so they are one wide layer; the later ones are batched.
         self.w1 = nn.Parameter(torch.cat([net[0].weight for net in nets]).detach().clone())
         self.b1 = nn.Parameter(torch.zeros(members * width))
-        self.w2 = nn.Parameter(torch.stack([net[1].weight.T for net in nets]).detach().clone())
-        self.b2 = nn.Parameter(torch.zeros(members, 1, width))
-        self.w3 = nn.Parameter(torch.stack([net[2].weight.T for net in nets]).detach().clone())
-        self.b3 = nn.Parameter(torch.zeros(members, 1, out_dim))
+        self._last = hidden + 1
+        for n in range(2, hidden + 2):
+            weight = torch.stack([net[n - 1].weight.T for net in nets]).detach().clone()
+            self.register_parameter(f"w{n}", nn.Parameter(weight))
+            self.register_parameter(f"b{n}", nn.Parameter(torch.zeros(members, 1, weight.shape[-1])))
         self.normalize = normalize
         if normalize:
             self.gain = nn.Parameter(torch.ones(members, width))
@@ -85,9 +96,13 @@ class EnsembleMLP(nn.Module):
         else:
             hidden = self.act(hidden)
         hidden = hidden.view(len(flat), self.members, -1).transpose(0, 1)  # (members, N, width)
-        hidden = self.act(torch.baddbmm(self.b2, hidden, self.w2))
-        out: Tensor = torch.baddbmm(self.b3, hidden, self.w3)  # (members, N, out_dim)
-        return out.view(self.members, *x.shape[:-1], self.b3.shape[-1])
+        for n in range(2, self._last):
+            hidden = self.act(self._layer(n, hidden))
+        out = self._layer(self._last, hidden)  # (members, N, out_dim)
+        return out.view(self.members, *x.shape[:-1], out.shape[-1])
+
+    def _layer(self, n: int, x: Tensor) -> Tensor:
+        return torch.baddbmm(getattr(self, f"b{n}"), x, getattr(self, f"w{n}"))
 
 
 class TwinMLP(EnsembleMLP):

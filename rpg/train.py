@@ -65,9 +65,14 @@ def train(cfg: DictConfig) -> dict[str, Any]:
         trainer, progress = assemble(cfg)
         (folder / OUTCOME).unlink(missing_ok=True)
 
+        warned: list[str] = []  # once is enough
+
         def show(row: Row) -> None:
             if row["updates"] and (told := compiling.LOG.news()):
                 progress.note(told)
+            if not warned and (warning := trainer.agent.warning()):
+                warned.append(warning)
+                progress.note(warning)
             shown = {key: row[key] for key in _SHOWN if key in row}
             progress.update(int(row["env_steps"]), int(row["updates"]), shown)
 

@@ -14,19 +14,20 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Job:
-    """One run: what it is called, where it goes, and its overrides."""
+    """One run: what it is called, where it goes, and its overrides; evaluations only if asked for."""
 
     name: str
     folder: Path
     overrides: tuple[str, ...]
     threads: int = 1
+    evaluates: bool = False
 
     @property
     def command(self) -> list[str]:
-        """The `rpg-train` command: files alone, no evaluations."""
+        """The `rpg-train` command: files alone."""
         return [
             sys.executable, "-m", "rpg.train", *self.overrides, f"threads={self.threads}", "logger=files",
-            "trainer.eval_every=0", f"run_dir='{self.folder}'",
+            *([] if self.evaluates else ["trainer.eval_every=0"]), f"run_dir='{self.folder}'",
         ]  # fmt: skip
 
 

@@ -10,9 +10,10 @@ import pytest
 from omegaconf import DictConfig, OmegaConf
 
 import rpg.conf
-from rpg.agents import RPGConfig, SACConfig, TDMPCConfig
+from rpg.agents import GoalDDPGConfig, GoalDQNConfig, RPGConfig, SACConfig, TDMPCConfig
 from rpg.envs.registration import register_all
 from rpg.exploration import Plan2ExploreConfig, RNDConfig
+from rpg.landmarks.config import PlannerConfig
 from rpg.train import train
 from rpg.training.build import parse_config
 from rpg.training.config import LoggerConfig, TrainerConfig
@@ -27,6 +28,7 @@ OPTIONS = sorted(
     for p in CONF.glob("*/*.yaml")
     if p.parent.name not in ("agent", "ablation", "method") and not p.stem.startswith("fig3")
 )
+GOALS = ["ddpg_her", "dqn_her"]  # run in environments of their own, tests/training/test_goal_training.py
 # What tells from a log row that an agent learned.
 LEARNERS = {
     "rpg": "loss/state",
@@ -58,7 +60,12 @@ def test_published_maze_is_the_defaults_in_code(composed: Composed) -> None:
 
 
 def test_paper_sizes_of_the_baselines_are_the_defaults_in_code(composed: Composed) -> None:
-    for agent, defaults in (("sac", SACConfig()), ("tdmpc", TDMPCConfig())):
+    for agent, defaults in (
+        ("sac", SACConfig()),
+        ("tdmpc", TDMPCConfig()),
+        ("ddpg_her", GoalDDPGConfig()),
+        ("dqn_her", GoalDQNConfig()),
+    ):
         run = parse_config(composed(f"agent={agent}", "size=paper", "env=gymnasium"))
         assert run.agent == defaults
     run = parse_config(composed("exploration=plan2explore", "size=paper", "env=gymnasium"))
@@ -91,6 +98,10 @@ def test_every_setting_can_be_given_on_the_command_line(composed: Composed) -> N
     assert leaves(agent) == leaves(asdict(RPGConfig())) | {".name"}
     assert leaves(settings("agent=sac")["agent"]) == leaves(asdict(SACConfig())) | {".name"}
     assert leaves(settings("agent=tdmpc")["agent"]) == leaves(asdict(TDMPCConfig())) | {".name"}
+    assert leaves(settings("agent=ddpg_her")["agent"]) == leaves(asdict(GoalDDPGConfig())) | {".name"}
+    assert leaves(settings("agent=dqn_her")["agent"]) == leaves(asdict(GoalDQNConfig())) | {".name"}
+    planner = settings("planner=landmarks")["planner"]
+    assert leaves(planner) == leaves(asdict(PlannerConfig())) | {".name"}
     for bonus, defaults in (("rnd", RNDConfig()), ("plan2explore", Plan2ExploreConfig())):
         assert leaves(settings(f"exploration={bonus}")["exploration"]) == leaves(asdict(defaults)) | {".name"}
     assert leaves(cfg["trainer"]) == leaves(asdict(TrainerConfig()))
@@ -111,7 +122,7 @@ def test_environments_in_the_configs_are_registered_or_need_a_package() -> None:
 
 
 @pytest.mark.parametrize("env", ["maze", "gymnasium", "bandit"])
-@pytest.mark.parametrize("agent", AGENTS)
+@pytest.mark.parametrize("agent", [name for name in AGENTS if name not in GOALS])
 def test_every_agent_runs_the_debug_preset(composed: Composed, tmp_path: Path, agent: str, env: str) -> None:
     quick = ["trainer.steps=60", "trainer.seed_decisions=40", "trainer.picture_every=0"]
     quick += ["trainer.eval_episodes=1", "trainer.eval_envs=1", "size.rnd_batch_size=16"]

@@ -17,6 +17,9 @@ import yaml
 
 from rpg.agents import (
     CEMConfig,
+    GoalDDPGConfig,
+    GoalDQNConfig,
+    HindsightConfig,
     LatentConfig,
     PlannerConfig,
     PolicyConfig,
@@ -163,6 +166,7 @@ def test_every_page_is_in_the_navigation() -> None:
         ),
         ("docs/environments.md", EnvConfig),
         *(("docs/baselines.md", schema) for schema in (SACConfig, TDMPCConfig, PlannerConfig)),
+        *(("docs/goal_agents.md", schema) for schema in (GoalDDPGConfig, GoalDQNConfig, HindsightConfig)),
         ("docs/exploration.md", RNDConfig),
         ("docs/exploration.md", Plan2ExploreConfig),
     ],

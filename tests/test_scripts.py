@@ -115,3 +115,37 @@ def test_sac_of_the_library_is_missed_in_one_line(tmp_path: Path) -> None:
     )  # fmt: skip
     assert done.returncode == 2
     assert "pip install stable-baselines3" in done.stderr.splitlines()[-1]
+
+
+def test_landmark_runs_are_gathered_by_method_and_drawn(tmp_path: Path) -> None:
+    script = str(ROOT / "scripts" / "landmarks.py")
+    small = [
+        "experiment=debug", "trainer.seed_decisions=50", "trainer.decisions_per_update=10", "trainer.eval_every=100",
+        "trainer.eval_episodes=1", "trainer.eval_envs=1", "trainer.picture_every=0", "trainer.log_every=100",
+        "planner.landmarks=8", "planner.candidates=20", "+env.kwargs.episode_steps=10",
+    ]  # fmt: skip
+    words = ("run", "four_room", "--steps", "200", "--stop", "none", "--set", *small)
+    assert run(tmp_path, script, *words).splitlines() == ["four_room planner seed 0: done"]
+    # A run that explored with its planner, which is not trained for real.
+    folder = next((tmp_path / "runs" / "landmarks" / "four_room").glob("planner*/seed0"))
+    other = folder.parents[1] / "planner,other" / "seed1"
+    other.mkdir(parents=True)
+    for name in ("run.json", "metrics.jsonl", "config.yaml"):
+        text = (folder / name).read_text()
+        (other / name).write_text(text.replace("share: 0.0", "share: 0.5").replace("\nseed: 0", "\nseed: 1"))
+    run(tmp_path, script, "gather", "four_room")
+    tables = {}
+    for name in ("four_room", "four_room_policy", "four_room_distortion"):
+        with (tmp_path / "results" / "landmarks" / f"{name}.csv").open() as file:
+            tables[name] = list(csv.DictReader(file))
+    success = ["method", "size", "seed", "env_steps", "wall_s", "success_last", "success_ever"]
+    assert list(tables["four_room"][0]) == list(tables["four_room_policy"][0]) == success
+    found = {(row["method"], row["size"], row["seed"], row["env_steps"]) for row in tables["four_room"]}
+    steps = ("100", "200")
+    planned = {("planner", "fast", seed, step) for seed in ("0", "1") for step in steps}
+    assert found == planned | {("her", "fast", "0", step) for step in steps}
+    assert {(row["method"], row["seed"]) for row in tables["four_room_policy"]} == {("policy", "1")}
+    assert len(tables["four_room_distortion"]) == 8
+    assert all(float(row["distortion"]) > 0 for row in tables["four_room_distortion"])
+    run(tmp_path, script, "draw", "four_room")
+    assert (tmp_path / "results" / "landmarks" / "four_room.png").stat().st_size > 1000

@@ -2,6 +2,9 @@
 
 from rpg.agents.agent import Agent
 from rpg.agents.config import EntropyDecay, PriorConfig, RewardRamp, RPGConfig
+from rpg.agents.goal import GoalAgent, GoalConfig, HindsightConfig
+from rpg.agents.goal_ddpg import GoalDDPG, GoalDDPGConfig
+from rpg.agents.goal_dqn import GoalDQN, GoalDQNConfig
 from rpg.agents.rpg import RPG
 from rpg.agents.sac import SAC, SACConfig
 from rpg.agents.tdmpc import TDMPC, TDMPCConfig
@@ -17,6 +20,13 @@ __all__ = [
     "Agent",
     "CEMConfig",
     "EntropyDecay",
+    "GoalAgent",
+    "GoalConfig",
+    "GoalDDPG",
+    "GoalDDPGConfig",
+    "GoalDQN",
+    "GoalDQNConfig",
+    "HindsightConfig",
     "LatentConfig",
     "PlannerConfig",
     "PolicyConfig",

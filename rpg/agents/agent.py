@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import gymnasium as gym
 import numpy as np
@@ -15,7 +15,34 @@ from rpg.errors import RPGError
 from rpg.pixels import FrameShape
 from rpg.segments import SegmentBatch
 
+if TYPE_CHECKING:
+    from rpg.agents.goal import Hindsight
+
 Metrics = dict[str, Tensor]
+
+
+class EvaluationMode(NamedTuple):
+    """How an agent acts while it is judged.
+
+    Attributes:
+        name: in the log, ``eval/<name>/...``.
+        deterministic: as in :meth:`Agent.act`.
+        planning: whether a planner is asked, if the agent has one.
+    """
+
+    name: str
+    deterministic: bool
+    planning: bool = True
+
+
+class Experience(Protocol):
+    """What an agent may see of the replay that it learns from."""
+
+    def __len__(self) -> int:
+        """Transitions stored."""
+
+    def observations(self, count: int) -> Tensor:
+        """Draw (count, obs_dim) stored observations, each the outcome of a transition."""
 
 
 class Agent:
@@ -29,12 +56,22 @@ class Agent:
         batch_size: segments per update; 0 if the agent does not learn.
         horizon: steps per segment.
         device: where tensors live.
+        takes_discrete: whether it acts on a ``Discrete`` space; its actions are then the index, one float column.
+        evaluations: how it is judged; the first counts for ``trainer.stop_at_success``.
+        hindsight: how replay relabels its goals; None for not at all.
     """
 
     latent_dim = 0
     batch_size = 0
     horizon = 1
+    takes_discrete = False
+    evaluations = (
+        EvaluationMode("deterministic", deterministic=True),
+        EvaluationMode("stochastic", deterministic=False),
+    )
+    hindsight: Hindsight | None = None
     _evaluating = False
+    _planning = True
 
     def __init__(
         self,
@@ -49,21 +86,30 @@ class Agent:
                 f"observation space {_brief(observation_space)}: a flat Box is needed, or pictures (height, width, "
                 "channels) of uint8; wrap the environment with gymnasium.wrappers.FlattenObservation"
             )
-        if not isinstance(action_space, gym.spaces.Box) or len(action_space.shape) != 1:
-            raise RPGError(f"action space {_brief(action_space)}: a flat Box of continuous actions is needed")
-        if not (np.isfinite(action_space.low).all() and np.isfinite(action_space.high).all()):
-            raise RPGError(
-                f"action space {_brief(action_space)}: bounds must be finite; wrap the environment with "
-                "gymnasium.wrappers.RescaleAction"
-            )
+        lowest, highest = self._bounds(action_space)
         self.obs_dim = int(np.prod(observation_space.shape or ()))
-        self.action_dim = action_space.shape[0]
+        self.action_dim = len(lowest)
         self.device = torch.device(device)
-        low = torch.as_tensor(action_space.low, dtype=torch.float32, device=self.device)
-        high = torch.as_tensor(action_space.high, dtype=torch.float32, device=self.device)
+        low = torch.as_tensor(lowest, dtype=torch.float32, device=self.device)
+        high = torch.as_tensor(highest, dtype=torch.float32, device=self.device)
         self._action_low, self._action_high = low, high
         self._action_middle = (high + low) / 2
         self._action_half = (high - low) / 2
+
+    def _bounds(self, space: gym.Space[Any]) -> tuple[np.ndarray, np.ndarray]:
+        if isinstance(space, gym.spaces.Discrete) and self.takes_discrete:
+            return np.zeros(1), np.full(1, space.n - 1)
+        if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
+            raise RPGError(f"action space {_brief(space)}: a flat Box of continuous actions is needed")
+        if not (np.isfinite(space.low).all() and np.isfinite(space.high).all()):
+            raise RPGError(
+                f"action space {_brief(space)}: bounds must be finite; wrap the environment with "
+                "gymnasium.wrappers.RescaleAction"
+            )
+        return space.low, space.high
+
+    def connect(self, replay: Experience) -> None:
+        """Told once of the replay that batches will come from."""
 
     @property
     def feature_dim(self) -> int:
@@ -101,6 +147,18 @@ class Agent:
         """
         return {}
 
+    def distances(self, obs: Tensor) -> dict[str, Tensor]:
+        """What it takes for the number of steps (n,) to the goals of observations (n, obs_dim), by evaluation mode."""
+        return {}
+
+    def report(self) -> dict[str, float]:
+        """Numbers for a log row beside those that :meth:`update` returns."""
+        return {}
+
+    def warning(self) -> str | None:
+        """One line on what keeps the agent from doing what it should, or None."""
+        return None
+
     def compile(self) -> None:
         """Compile what is worth it; called once, before the first update. Results stay the same."""
 
@@ -119,14 +177,18 @@ class Agent:
         """Continue from :meth:`episode_state`."""
 
     @contextmanager
-    def evaluating(self) -> Iterator[None]:
-        """Act in other environments for a while: nothing is remembered, running episodes go on afterwards."""
+    def evaluating(self, planning: bool = True) -> Iterator[None]:
+        """Act in other environments for a while: nothing is remembered, running episodes go on afterwards.
+
+        Args:
+            planning: see :class:`EvaluationMode`.
+        """
         held = self.episode_state()
-        self._evaluating = True
+        self._evaluating, self._planning = True, planning
         try:
             yield
         finally:
-            self._evaluating = False
+            self._evaluating, self._planning = False, True
             self.restore_episode_state(held)
 
     def uniform(self, n: int) -> Tensor:

@@ -59,3 +59,14 @@ class Tracked(Protocol):
 
     def make_tracker(self) -> Tracker:
         """A fresh tracker for one training run."""
+
+
+@runtime_checkable
+class KnownDistances(Protocol):
+    """An environment of few enough states that the fewest steps between them are known."""
+
+    states: np.ndarray
+    """(n, S), as observed."""
+
+    def distances(self) -> np.ndarray:
+        """Fewest steps (n, n) from each state to the goal that each has achieved."""

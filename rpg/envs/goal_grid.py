@@ -87,6 +87,10 @@ class FourRoomVectorEnv(GoalVectorEnv):
         """Fewest steps between all pairs of free cells, (56, 56), in the order of ``cells``."""
         return distances(self.free)
 
+    def places(self, goals: Floats) -> Floats:
+        """Where goals (n, 121) lie in pictures, (n, 2)."""
+        return np.stack([_centre(*divmod(int(cell), _SIDE)) for cell in goals.argmax(axis=-1)])
+
     def _begin(self, rows: Integers, start: Floats | None, goal: Floats | None) -> None:
         count = len(self.cells)
         drawn = self._streams.uniform(rows, 2)  # always, so that a given goal does not change the start

@@ -27,6 +27,8 @@ from rpg.exploration import (
     RandomNetworkDistillation,
     RNDConfig,
 )
+from rpg.goals import goal_spec_of
+from rpg.landmarks.config import PlannerConfig
 from rpg.pixels import FrameShape
 from rpg.training.checkpoint import load_checkpoint
 from rpg.training.config import LoggerConfig, RunConfig, TrainerConfig
@@ -39,6 +41,9 @@ EXPLORATIONS: dict[str, type[Any]] = {
     "plan2explore": Plan2ExploreConfig,
 }
 """Settings of the exploration bonuses by name."""
+
+PLANNERS = ("none", "landmarks")
+"""The planners of goal-conditioned agents by name."""
 
 
 def env_preset(name: str) -> EnvConfig:
@@ -72,6 +77,10 @@ def parse_config(cfg: DictConfig) -> RunConfig:
     exploration_name = exploration.pop("name", None)
     if exploration_name not in EXPLORATIONS:
         raise RPGError(f"exploration.name={exploration_name!r}: choose {', '.join(EXPLORATIONS)}")
+    planner = dict(plain.get("planner") or {"name": "none"})
+    planner_name = planner.pop("name", None)
+    if planner_name not in PLANNERS:
+        raise RPGError(f"planner.name={planner_name!r}: choose {', '.join(PLANNERS)}")
     threads = plain.get("threads")
     if threads is not None and (not isinstance(threads, int) or threads < 1):
         raise RPGError(f"threads={threads!r}: a whole number of at least 1, or null")
@@ -85,6 +94,7 @@ def parse_config(cfg: DictConfig) -> RunConfig:
         agent_options={} if learner else agent,
         exploration_name=exploration_name if learner else "none",
         exploration=_section(EXPLORATIONS[exploration_name], exploration, "exploration"),
+        planner=None if planner_name == "none" else _section(PlannerConfig, planner, "planner"),
         env=_section(EnvConfig, plain["env"], "env"),
         trainer=_section(TrainerConfig, plain["trainer"], "trainer"),
         logger=_section(LoggerConfig, plain["logger"], "logger"),
@@ -154,16 +164,27 @@ def build_agent(run: RunConfig, envs: Any) -> tuple[Agent, ObjectsOfInterest]:
     if run.agent_name in SCRIPTED:
         agent: Agent = make_scripted(run.agent_name, obs_space, action_space, run.device, **run.agent_options)
         return agent, ObjectsOfInterest.of(())
+    learner = LEARNERS[run.agent_name]
+    if learner.goals:
+        spec = goal_spec_of(envs)
+        agent = learner.build(obs_space, action_space, spec, run.agent, run.planner, run.device)
+        return agent, ObjectsOfInterest.of(())
+    if run.planner is not None:
+        raise RPGError(f"planner=landmarks: agent={run.agent_name} has no goals; choose ddpg_her or dqn_her")
     Agent(obs_space, action_space)  # spaces are checked before their shape is used
     objects = ObjectsOfInterest.of(()) if frames else objects_of_interest(run.env, envs, obs_space.shape[0])
-    build = LEARNERS[run.agent_name].build
-    return build(obs_space, action_space, run.agent, objects, run.device), objects
+    return learner.build(obs_space, action_space, run.agent, objects, run.device), objects
 
 
 def build_exploration(run: RunConfig, agent: Agent, objects: ObjectsOfInterest) -> ExplorationBonus | None:
     """Make the bonus that the run asks for, if any."""
     if run.exploration_name == "none":
         return None
+    if agent.hindsight is not None:
+        raise RPGError(
+            f"exploration={run.exploration_name}: the value of agent={run.agent_name} is a distance, to which no "
+            "bonus can be added; choose exploration=none"
+        )
     if isinstance(run.exploration, Plan2ExploreConfig):
         return Plan2Explore(agent, run.exploration)
     return RandomNetworkDistillation(agent.frames or objects, run.exploration, run.device)
@@ -215,8 +236,8 @@ def _sinks(run: RunConfig, run_dir: Path) -> list[Sink]:
 
 # Settings that may change between restarts without making it another run.
 _FREE = (
-    "trainer.steps", "trainer.checkpoint_every", "device", "compile", "threads", "run_dir", "logger", "budget",
-    "whole",
+    "trainer.steps", "trainer.stop_at_success", "trainer.checkpoint_every", "device", "compile", "threads",
+    "run_dir", "logger", "budget", "whole",
 )  # fmt: skip
 
 

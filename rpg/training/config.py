@@ -9,6 +9,7 @@ from rpg.agents.config import LearnerConfig
 from rpg.envs.config import EnvConfig
 from rpg.errors import RPGError
 from rpg.exploration import Plan2ExploreConfig, RNDConfig
+from rpg.landmarks.config import PlannerConfig
 
 
 @dataclass
@@ -33,6 +34,8 @@ class TrainerConfig:
         checkpoint_every: between checkpoints.
         picture_every: between pictures; 0 never.
         video_every: between videos of an episode with deterministic actions; 0 never.
+        stop_at_success: end the run once the share of evaluation episodes that succeed at their end reaches
+            this three evaluations in a row, by the first mode that the agent is judged in; None never.
     """
 
     steps: int = 240_000
@@ -49,6 +52,7 @@ class TrainerConfig:
     checkpoint_every: int = 10_000
     picture_every: int = 20_000
     video_every: int = 0
+    stop_at_success: float | None = None
 
     def __post_init__(self) -> None:
         for name in ("steps", "recent_window", "log_every", "checkpoint_every", "eval_episodes", "eval_envs"):
@@ -65,6 +69,8 @@ class TrainerConfig:
                 f"trainer.recent_fraction={self.recent_fraction} and novel_fraction={self.novel_fraction}: "
                 "together at most 1"
             )
+        if self.stop_at_success is not None and not 0 < self.stop_at_success <= 1:
+            raise RPGError(f"trainer.stop_at_success={self.stop_at_success}: must lie in (0, 1], or be null")
 
 
 @dataclass
@@ -85,6 +91,7 @@ class RunConfig:
     agent_options: dict[str, Any]
     exploration_name: str
     exploration: RNDConfig | Plan2ExploreConfig
+    planner: PlannerConfig | None
     env: EnvConfig
     trainer: TrainerConfig
     logger: LoggerConfig

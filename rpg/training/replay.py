@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -13,6 +13,20 @@ from rpg.pixels import FrameShape
 from rpg.segments import SegmentBatch
 from rpg.training.frames import FrameRing
 from rpg.training.priorities import NoveltyPriorities
+
+
+class Shares(NamedTuple):
+    """How a batch is put together; what is not said is drawn uniformly.
+
+    Attributes:
+        recent: share from the newest transitions alone, so that a discovery is learned from while it is news.
+        recent_window: how many transitions are the newest.
+        novel: share in proportion to :attr:`SegmentReplay.priorities`.
+    """
+
+    recent: float = 0.0
+    recent_window: int = 5000
+    novel: float = 0.0
 
 
 class SegmentReplay:
@@ -137,39 +151,39 @@ class SegmentReplay:
             self._data[self._head - 1, :, self._ends] = 1.0
         self._episode_step.zero_()
 
-    def sample(
-        self,
-        batch_size: int,
-        horizon: int,
-        recent_fraction: float = 0.0,
-        recent_window: int = 5000,
-        novel_fraction: float = 0.0,
-    ) -> SegmentBatch:
+    def sample(self, batch_size: int, horizon: int, shares: Shares | None = None) -> SegmentBatch:
         """Draw ``batch_size`` segments of ``horizon`` steps, uniform over stored transitions.
 
         Args:
             batch_size: N.
             horizon: K.
-            recent_fraction: share of the batch drawn from the newest ``recent_window`` transitions alone,
-                so that a discovery is learned from while it is still news.
-            recent_window: in transitions.
-            novel_fraction: share drawn in proportion to :attr:`priorities`.
+            shares: how much of the batch is drawn otherwise.
         """
+        return self._segments(*self._draw(batch_size, shares or Shares()), horizon)
+
+    def _draw(self, batch_size: int, shares: Shares) -> tuple[Tensor, Tensor]:
+        """Where segments begin: age of the row (N,), 0 for the oldest, and environment (N,)."""
         if not self._filled:
             raise RPGError("replay is empty: add transitions before sampling")
         device = self._data.device
-        oldest = self._head - self._filled
-        age = torch.randint(self._filled, (batch_size,), device=device)  # 0 is the oldest row
-        recent = round(batch_size * recent_fraction)
+        age = torch.randint(self._filled, (batch_size,), device=device)
+        recent = round(batch_size * shares.recent)
         if recent:
-            window = min(self._filled, max(recent_window // self._num_envs, 1))
+            window = min(self._filled, max(shares.recent_window // self._num_envs, 1))
             age[:recent] = torch.randint(self._filled - window, self._filled, (recent,), device=device)
         env = torch.randint(self._num_envs, (batch_size,), device=device)
-        novel = round(batch_size * novel_fraction)
+        novel = round(batch_size * shares.novel)
         if self.priorities is not None and novel:
-            index = self.priorities.draw(novel)
-            age[-novel:] = (index // self._num_envs - oldest) % self._rows
-            env[-novel:] = index % self._num_envs
+            place = self.priorities.draw(novel)
+            age[-novel:] = (place // self._num_envs - self._head + self._filled) % self._rows
+            env[-novel:] = place % self._num_envs
+        return age, env
+
+    def _segments(self, age: Tensor, env: Tensor, horizon: int) -> SegmentBatch:
+        """The segments of ``horizon`` steps that begin there."""
+        batch_size = len(age)
+        device = self._data.device
+        oldest = self._head - self._filled
         steps = torch.arange(horizon, device=device).unsqueeze(1)
         ages = age + steps  # (K, N)
         # Beyond the newest row nothing is known yet: such steps are masked like those after an ending.

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from gymnasium.spaces import Discrete
 from gymnasium.vector import AutoresetMode, VectorEnv
 from torch import Tensor
 
@@ -75,6 +76,8 @@ class Runner:
         self._length = np.zeros(n, dtype=np.int64)
         self._ever = np.zeros(n, dtype=np.bool_)
         self._steps = 0
+        space = envs.single_action_space
+        self._first_action = int(space.start) if isinstance(space, Discrete) else None
 
     @property
     def at_boundary(self) -> bool:
@@ -107,6 +110,8 @@ class Runner:
         action = self._agent.act(self._tensor(self._obs), self._latent, deterministic)
         sent = action.cpu().numpy()
         self._require_finite(sent, "action")
+        if self._first_action is not None:  # agents count discrete actions from 0, as one float column
+            sent = np.rint(sent[:, 0]).astype(np.int64) + self._first_action
         with self._watching_workers():
             next_obs, reward, terminated, truncated, info = self._envs.step(sent)
         self._steps += 1
@@ -241,6 +246,7 @@ def evaluate(
     seed: int,
     deterministic: bool,
     name: str = "env",
+    planning: bool = True,
 ) -> list[Episode]:
     """Run whole episodes from fixed seeds without touching any random state of training.
 
@@ -252,11 +258,12 @@ def evaluate(
         seed: of the evaluation; equal seeds give equal episodes.
         deterministic: take the mode of pi(a|s, z) instead of a sample. z is drawn either way.
         name: of the environment, for messages.
+        planning: whether a planner is asked, if the agent has one.
     """
     per_env = -(-episodes // envs.num_envs)
     devices = [agent.device] if agent.device.type == "cuda" else []
     finished: list[Episode] = []
-    with agent.evaluating(), torch.random.fork_rng(devices):
+    with agent.evaluating(planning), torch.random.fork_rng(devices):
         torch.manual_seed(seed)
         runner = Runner(agent, envs, seed, name)
         runner.reset()

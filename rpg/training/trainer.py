@@ -20,13 +20,17 @@ from rpg.errors import NonFiniteError, RPGError
 from rpg.exploration import ExplorationBonus
 from rpg.training.checkpoint import load_checkpoint, save_checkpoint
 from rpg.training.config import TrainerConfig
+from rpg.training.distances import distance_errors
+from rpg.training.hindsight import make_replay
 from rpg.training.loggers import Loggers
-from rpg.training.replay import SegmentReplay
+from rpg.training.map_picture import map_picture
+from rpg.training.replay import Shares
 from rpg.training.runner import Episode, Runner, evaluate, summarize
 from rpg.training.video import film
 
 Row = dict[str, float | int | str]
 
+_IN_A_ROW = 3  # evaluations that must succeed before a run stops early
 _EVALUATION_SEED = 1_000_000  # added to the run's seed, so that evaluation does not replay training episodes
 
 
@@ -77,17 +81,12 @@ class Trainer:
                 "choose exploration=rnd, or 0"
             )
         self._runner = Runner(agent, envs, seed, env_name)
-        self._replay = SegmentReplay(
-            agent.obs_dim,
-            agent.action_dim,
-            agent.latent_dim,
-            envs.num_envs,
-            config.replay_capacity,
-            agent.device,
-            with_bonus=exploration is not None and not exploration.config.relabel,
-            frames=agent.frames,
-            prioritized=config.novel_fraction > 0,
+        with_bonus = exploration is not None and not exploration.config.relabel
+        self._replay = make_replay(
+            agent, envs.num_envs, config.replay_capacity, with_bonus, prioritized=config.novel_fraction > 0
         )
+        self._shares = Shares(config.recent_fraction, config.recent_window, config.novel_fraction)
+        agent.connect(self._replay)
         self._tracker = envs.make_tracker() if isinstance(envs, Tracked) else None
         self.decisions = self.updates = self._ticks = 0
         self._sums: dict[str, Tensor] = {}
@@ -96,6 +95,7 @@ class Trainer:
         self._last_row: Row = {}
         self._due_checkpoint = self._started = False
         self._saved_at = 0  # decisions
+        self._successes = 0  # evaluations in a row that reached stop_at_success
         self._wall_before, self._clock = 0.0, time.perf_counter()
         self._speed = (0, 0, 0.0)  # decisions, updates, wall_s at the last log row
 
@@ -109,6 +109,11 @@ class Trainer:
         """Seconds of training, summed over restarts."""
         return self._wall_before + time.perf_counter() - self._clock
 
+    @property
+    def finished(self) -> bool:
+        """Whether the run is over: all its steps are done, or it succeeds often enough to stop early."""
+        return self.env_steps >= self.config.steps or self._successes >= _IN_A_ROW
+
     def compile(self) -> None:
         """Compile the learning step: agent and exploration."""
         self.agent.compile()
@@ -120,7 +125,7 @@ class Trainer:
         should_stop: Callable[[], bool] = lambda: False,
         on_row: Callable[[Row], None] = lambda row: None,
     ) -> Row:
-        """Run until ``config.steps``, or until ``should_stop`` asks to; either way a checkpoint is written.
+        """Run until :attr:`finished`, or until ``should_stop`` asks to; either way a checkpoint is written.
 
         Args:
             should_stop: looked at after every vector step.
@@ -132,7 +137,7 @@ class Trainer:
         self._clock = time.perf_counter()
         if not self._started:
             self.start()
-        while self.env_steps < self.config.steps and not should_stop():
+        while not self.finished and not should_stop():
             self.collect_once()
             while self._ticks < self._ticks_due():
                 self._ticks += 1
@@ -143,13 +148,12 @@ class Trainer:
                 self.film()
             if self._due(self.config.log_every):
                 on_row(self._log())
-            finished = self.env_steps >= self.config.steps  # then both follow below
-            if self._due(self.config.picture_every) and not finished:
+            if self._due(self.config.picture_every) and not self.finished:  # then both follow below
                 self.draw()
-            self._due_checkpoint |= self._due(self.config.checkpoint_every) and not finished
+            self._due_checkpoint |= self._due(self.config.checkpoint_every) and not self.finished
             if self._due_checkpoint and self._may_save():
                 self.save()
-        if self.env_steps >= self.config.steps and self.config.picture_every:
+        if self.finished and self.config.picture_every:
             self.draw()
         self.save()
         return self._last_row
@@ -216,13 +220,7 @@ class Trainer:
 
     def update_agent(self) -> None:
         """Sample segments, judge their novelty as it is now, and let the agent learn from them."""
-        batch = self._replay.sample(
-            self.agent.batch_size,
-            self.agent.horizon,
-            self.config.recent_fraction,
-            self.config.recent_window,
-            self.config.novel_fraction,
-        )
+        batch = self._replay.sample(self.agent.batch_size, self.agent.horizon, self._shares)
         if self.exploration is not None and self.exploration.config.relabel:
             batch = self.exploration.relabel(batch)
         if self._replay.priorities is not None and batch.place is not None and batch.bonus is not None:
@@ -251,7 +249,7 @@ class Trainer:
         row = self._progress()
         if self._tracker is not None:
             row |= {f"train/{k}": v for k, v in self._tracker.metrics().items()}
-        row |= summarize(self._episodes, "train")
+        row |= summarize(self._episodes, "train") | self.agent.report()
         means = {key: float(self._sums[key]) / self._counts[key] for key in sorted(self._sums)}
         row |= means
         wall = self.wall_s
@@ -274,27 +272,44 @@ class Trainer:
         return row
 
     def _evaluate(self) -> None:
-        if self._eval_envs is None:
-            self._eval_envs = self._make_eval_envs()
+        envs = self._evaluation_envs()
         row = self._progress()
-        for mode, deterministic in (("deterministic", True), ("stochastic", False)):
+        for mode, deterministic, planning in self.agent.evaluations:
             episodes = evaluate(
                 self.agent,
-                self._eval_envs,
+                envs,
                 self.config.eval_episodes,
                 self._seed + _EVALUATION_SEED,
                 deterministic,
                 self._env_name,
+                planning,
             )
             row |= summarize(episodes, f"eval/{mode}")
+        row |= distance_errors(self.agent, envs)
         self._loggers.log(row, self.env_steps)
         self._last_row = self._last_row | row
+        self._judge(row)
+
+    def _evaluation_envs(self) -> VectorEnv[Any, Any, Any]:
+        if self._eval_envs is None:
+            self._eval_envs = self._make_eval_envs()
+        return self._eval_envs
+
+    def _judge(self, row: Row) -> None:
+        """Count evaluations in a row that reach ``stop_at_success``."""
+        if self.config.stop_at_success is not None:
+            success = float(row[f"eval/{self.agent.evaluations[0].name}/success_end"])
+            self._successes = self._successes + 1 if success >= self.config.stop_at_success else 0
 
     def draw(self) -> None:
-        """Write the tracker's picture of progress, if it has one."""
+        """Write the tracker's picture of progress and that of the agent's map, if there are such."""
         picture = self._tracker.picture() if self._tracker is not None else None
         if picture is not None:
             self._loggers.picture("progress", picture, self.env_steps)
+        if self.agent.hindsight is not None:
+            chart = map_picture(self.agent, self._evaluation_envs(), self._seed + _EVALUATION_SEED)
+            if chart is not None:
+                self._loggers.picture("map", chart, self.env_steps)
 
     def film(self) -> None:
         """Write a video of an evaluation episode into the run folder, if there is an environment for it."""
@@ -345,6 +360,7 @@ class Trainer:
             "counts": dict(self._counts),
             "episodes": [tuple(e) for e in self._episodes],
             "last_row": dict(self._last_row),
+            "successes": self._successes,
             "rng": torch.get_rng_state(),
             "cuda_rng": torch.cuda.get_rng_state(self.agent.device) if cuda else None,
         }
@@ -370,7 +386,7 @@ class Trainer:
             )
         self._sums, self._counts = state["sums"], state["counts"]
         self._episodes = [Episode(*e) for e in state["episodes"]]
-        self._last_row = state["last_row"]
+        self._last_row, self._successes = state["last_row"], state["successes"]
         self.agent.restore_episode_state(state["episode_state"])
         torch.set_rng_state(state["rng"])
         if state["cuda_rng"] is not None:

@@ -10,7 +10,7 @@ import torch
 
 from rpg.errors import RPGError
 from rpg.segments import SegmentBatch
-from rpg.training.replay import SegmentReplay
+from rpg.training.replay import SegmentReplay, Shares
 
 ENVS = 3
 HORIZON = 4
@@ -180,7 +180,7 @@ def test_recent_transitions_can_be_preferred() -> None:
     recorder.length[:] = 1000
     recorder.play(200)
     torch.manual_seed(0)
-    step = recorder.replay.sample(1000, HORIZON, recent_fraction=0.5, recent_window=10 * ENVS).step
+    step = recorder.replay.sample(1000, HORIZON, Shares(recent=0.5, recent_window=10 * ENVS)).step
     assert step[:500].min() == 190
     assert step[500:].min() < 20
 
@@ -197,9 +197,7 @@ def test_novel_transitions_can_be_preferred(vector_steps: int) -> None:
     # The environment observes how many steps it took; those whose number ends in 77 are novel.
     novelty = (everything.step % 100 == 77).float()
     replay.priorities.judge(everything.place, novelty)
-    step = replay.sample(
-        1000, HORIZON, recent_fraction=0.25, recent_window=10 * ENVS, novel_fraction=0.5
-    ).step
+    step = replay.sample(1000, HORIZON, Shares(recent=0.25, recent_window=10 * ENVS, novel=0.5)).step
     assert set((step[500:] % 100).tolist()) == {77}
     assert (step[250:500] % 100 != 77).float().mean() > 0.9
     assert step[:250].min() == vector_steps - 10
@@ -214,7 +212,7 @@ def test_priorities_go_on_after_a_restart() -> None:
     recorder.replay.priorities.judge(batch.place, (batch.step == 1).float())
     resumed = make(prioritized=True)
     resumed.load_state_dict(through_a_file(recorder.replay.state_dict()))
-    assert set(resumed.sample(200, 1, novel_fraction=1.0).step.tolist()) == {1.0}
+    assert set(resumed.sample(200, 1, Shares(novel=1.0)).step.tolist()) == {1.0}
 
 
 def through_a_file(state: dict[str, Any]) -> dict[str, Any]:

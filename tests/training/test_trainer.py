@@ -22,6 +22,7 @@ from rpg.train import assemble, train
 from rpg.training.checkpoint import load_checkpoint
 from rpg.training.config import TrainerConfig
 from rpg.training.loggers import Loggers, read_rows
+from rpg.training.replay import Shares
 from rpg.training.trainer import Trainer
 
 Composed = Callable[..., DictConfig]
@@ -122,7 +123,7 @@ def test_what_a_batch_says_of_novelty_is_remembered(composed: Composed, tmp_path
         trainer.train()
         assert trainer.exploration is not None
         torch.manual_seed(0)
-        batch = trainer.exploration.relabel(trainer._replay.sample(4000, 1, novel_fraction=0.5))
+        batch = trainer.exploration.relabel(trainer._replay.sample(4000, 1, Shares(novel=0.5)))
         assert batch.bonus is not None
         uniform, novel = batch.bonus[0].split(2000)
         assert novel.clamp(min=0).mean() > 1.2 * uniform.clamp(min=0).mean()
