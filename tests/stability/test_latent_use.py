@@ -107,7 +107,11 @@ def test_moderate_beta_keeps_several_modes_of_the_bandit() -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("beta", [0.0, 0.01, 0.5])
 def test_information_in_the_maze(beta: float, tmp_path_factory: pytest.TempPathFactory) -> None:
-    """25k steps with a categorical z: information between z and the cell where an episode ends."""
+    """25k steps with a categorical z: information between z and the cell where an episode ends.
+
+    Of 600 episodes, independent z and cells give up to 0.1 nats by chance. With the published 0.01 z tells no more
+    than that so early; 0.5 makes z known.
+    """
     from rpg.envs.make import make_envs
     from rpg.train import assemble
     from rpg.training.build import parse_config
@@ -127,10 +131,11 @@ def test_information_in_the_maze(beta: float, tmp_path_factory: pytest.TempPathF
     cells = np.clip(((obs + 5) // 2).astype(int), 0, 4)
     information = mutual_information(latent.argmax(1).numpy(), cells[:, 0] * 5 + cells[:, 1])
     _INFORMATION[beta] = information
+    by_chance = 0.2
     passed = {
-        0.0: information < 1.0,
-        0.01: information > _INFORMATION.get(0.0, 0.0),
-        0.5: information > _INFORMATION.get(0.0, 0.0),
+        0.0: information < by_chance,
+        0.01: information < 1.0,
+        0.5: information > max(_INFORMATION.get(lower, 0.0) for lower in (0.0, 0.01)) + by_chance,
     }[beta]
     record("latent_information", 0, {"beta": beta, "env_steps": 25_000}, "mutual_information_nats", information,
            passed, time.perf_counter() - start)  # fmt: skip
