@@ -52,7 +52,7 @@ class Streams:
         ahead = np.arange(1, size + 1, dtype=np.uint64) * _STEP
         bits = _mixed(self._state[rows, None] + ahead)
         self._state[rows] += np.uint64(size) * _STEP
-        return (bits >> np.uint64(11)) * 2.0**-53
+        return (bits >> np.uint64(11)).astype(np.float64) * 2.0**-53
 
     def where(self, rows: Integers, low: Floats, high: Floats, accept: Callable[[Floats], Mask]) -> Floats:
         """Places (len(rows), d), each uniform among those between ``low`` and ``high`` (d,) that are accepted.
