@@ -147,10 +147,11 @@ def make_replay(agent: Agent, num_envs: int, capacity: int, with_bonus: bool = F
         capacity: transitions kept.
         with_bonus: as in :class:`SegmentReplay`.
     """
-    shape = agent.obs_dim, agent.action_dim, agent.latent_dim, num_envs, capacity, agent.device, with_bonus
+    dims = agent.obs_dim, agent.action_dim, agent.latent_dim
     if agent.hindsight is None:
-        return SegmentReplay(*shape, frames=agent.frames)
-    return HindsightReplay(*agent.hindsight, *shape)
+        return SegmentReplay(*dims, num_envs, capacity, agent.device, with_bonus, agent.frames)
+    spec, config = agent.hindsight
+    return HindsightReplay(spec, config, *dims, num_envs, capacity, agent.device, with_bonus)
 
 
 def stored_replay(agent: Agent, state: dict[str, Any]) -> SegmentReplay:
