@@ -39,9 +39,11 @@ ONCE = 500  # maps of more landmarks are made once, not --repeats times
 
 def distance_of(width: int, device: str) -> Distance:
     """The L2 distance, with ``width`` > 0 after a network that adds almost nothing but its work."""
-    torch.manual_seed(0)
-    layers = [nn.Linear(4, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 1)]
-    network = nn.Sequential(*layers).to(device) if width else None
+    network: nn.Module | None = None
+    if width:
+        torch.manual_seed(0)
+        layers = [nn.Linear(4, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 1)]
+        network = nn.Sequential(*layers).to(device)
 
     def distance(state: Tensor, goal: Tensor) -> Tensor:
         straight = (state - goal).square().sum(dim=-1).sqrt()

@@ -129,6 +129,23 @@ def simulating(lines: list[Line]) -> str:
     return markdown(head.split(","), [*PLASTICINE_REFERENCES, *rows] if rows else [])
 
 
+def planning(lines: list[Line]) -> str:
+    """Landmark maps, one row for each size, stepped for the most environments."""
+    head = "name,on,threads,landmarks,choose ms,map s,plain loops s,ten states in s"
+    head += ",environments,step ms,plain loops ms,new goals ms,commit"
+    of_map = ("landmarks", "choose_ms", "build_s", "naive_build_s", "insert_s")
+    of_step = ("num_envs", "step_ms", "naive_step_ms", "new_goals_ms")
+    rows = [
+        [
+            line["name"], line["cpu"], str(line["threads"]), *(number(point.get(key)) for key in of_map),
+            *(number(point["envs"][-1].get(key)) for key in of_step), line["commit"],
+        ]
+        for line in lines
+        for point in line["points"]
+    ]  # fmt: skip
+    return markdown(head.split(","), rows)
+
+
 def tables(folder: Path) -> str:
     """What stands between the markers, from the files of ``folder``."""
     lines = newest(
@@ -141,6 +158,7 @@ def tables(folder: Path) -> str:
         ("Replay", "replay", replaying),
         ("Threads", "threads/", threading),
         ("Soft bodies", "plasticine/", simulating),
+        ("Landmark maps", "planner/", planning),
     ):
         text = write([line for line in lines if line["name"].startswith(kind)])
         parts += [f"### {title}", text] if text else []

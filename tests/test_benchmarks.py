@@ -121,6 +121,38 @@ def test_replay_and_act_print_a_point_for_each_combination(
     assert {path.name for path in tmp_path.iterdir()} == {"act.jsonl", "replay.jsonl"}
 
 
+def test_planner_times_maps_that_equal_those_of_plain_loops(
+    script: Script, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    planner, words = script("planner"), ["--repeats=1", "--envs=1,3", f"--out={tmp_path}"]
+    planner.main([*words, "--landmarks=8,16", "--naive=8"])
+    line = printed(capsys)
+    assert json.loads((tmp_path / "planner.jsonl").read_text()) == line
+    assert (tmp_path / "planner.png").stat().st_size > 1000
+    assert [point["landmarks"] for point in line["points"]] == [8, 16]
+    assert [("naive_build_s" in point, point["build_s"] > 0) for point in line["points"]] == [
+        (True, True),
+        (False, True),
+    ]
+    for point in line["points"]:
+        assert [entry["num_envs"] for entry in point["envs"]] == [1, 3]
+        assert point["insert_into"] > point["landmarks"] // 2
+    assert line["median"] == line["points"][-1]["envs"][-1]["step_ms"] > 0
+    text = script("table").tables(tmp_path)
+    assert "### Landmark maps" in text
+    assert len({row.count("|") for row in text.split("\n\n")[1].splitlines()}) == 1
+    true = planner.naive_map
+    planner.naive_map = lambda *given: (true(*given)[0], true(*given)[1] + 1)
+    assert "not that of the plain loops" in refusal(capsys, planner.main, *words, "--landmarks=8")
+
+
+def test_planner_behind_a_network(script: Script, capsys: pytest.CaptureFixture[str]) -> None:
+    script("planner").main(["--repeats=1", "--envs=2", "--landmarks=6", "--width=8", "--naive=6"])
+    line = printed(capsys)
+    assert line["name"] == "planner/8"
+    assert line["points"][0]["envs"][0]["naive_step_ms"] > 0
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [

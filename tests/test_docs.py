@@ -39,7 +39,7 @@ PAGES = [
     *sorted(str(p.relative_to(ROOT)) for p in (ROOT / "docs").rglob("*.md")),
 ]
 RUN_PAGES = ("README.md", "docs/quickstart.md")
-EXAMPLE_PAGES = ("README.md", "docs/agents.md", "docs/environments.md")
+EXAMPLE_PAGES = ("README.md", "docs/agents.md", "docs/environments.md", "docs/landmarks.md")
 
 SMALL = ["experiment=debug", "trainer.steps=60", "trainer.seed_decisions=40", "trainer.eval_every=0"]
 # Folders are named as the user's would be, so that later commands find what earlier ones made.

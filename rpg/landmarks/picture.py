@@ -111,8 +111,11 @@ def paint_map(
         axes.add_collection(LineCollection(list(landmarks[pairs]), colors=colour, linewidths=0.5, zorder=1))
     segments = np.asarray(walls, dtype=np.float64).reshape(-1, 2, 2)
     axes.add_collection(LineCollection(list(segments), colors=_WALL, linewidths=1.6, zorder=2))
-    dots = axes.scatter(*landmarks[known].T, c=lengths[known], s=14, cmap="viridis", linewidths=0, zorder=3)
-    axes.scatter(*landmarks[~known].T, s=14, facecolors="none", edgecolors=_WALL, linewidths=0.8, zorder=3)
+    reached, lost = landmarks[known], landmarks[~known]
+    dots = axes.scatter(
+        reached[:, 0], reached[:, 1], c=lengths[known], s=14, cmap="viridis", linewidths=0, zorder=3
+    )
+    axes.scatter(lost[:, 0], lost[:, 1], s=14, facecolors="none", edgecolors=_WALL, linewidths=0.8, zorder=3)
     stops = np.concatenate([located(start), located(way)])
     axes.plot(*stops.T, color=_WAY, linewidth=1.8, marker="o", markersize=3.5, zorder=4)
     axes.plot(*stops[0], color=_START, marker="+", markersize=10, markeredgewidth=2.0, zorder=5)

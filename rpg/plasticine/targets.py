@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
-from rpg.errors import RPGError, nearest, require_extra
+from rpg.errors import RPGError, nearest
 from rpg.plasticine.score import score_mass
 
 ENV_VAR = "RPG_PLASTICINE_TARGETS"
@@ -42,9 +43,6 @@ class Target:
 
         The distance of a node is to the nearest node of the target, 0 inside (Euclidean, unit of the domain's edge).
         """
-        require_extra("scipy", "plasticine", "a target's distance field")
-        from scipy.ndimage import distance_transform_edt
-
         mass = self.mass if grid == self.grid else _resample(self.mass, grid)
         threshold = SDF_THRESHOLD * (PUBLIC_GRID / grid) ** 3
         inside = (mass > threshold).numpy()
