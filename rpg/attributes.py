@@ -13,13 +13,10 @@ def declared(envs: Any, name: str) -> Any:
     """
     layer = envs
     while layer is not None:
-        # Not hasattr: a wrapper that forwards attributes would hide get_attr of the batch it wraps.
         if (own := getattr(layer, name, None)) is not None:
             return own
-        if hasattr(type(layer), "get_attr"):
-            try:
-                return layer.get_attr(name)[0]
-            except AttributeError:
-                pass
+        # Asked first: a worker process that is asked for what it has not would end.
+        if hasattr(type(layer), "get_attr") and layer.call("has_wrapper_attr", name)[0]:
+            return layer.get_attr(name)[0]
         layer = getattr(layer, "env", None)
     return None

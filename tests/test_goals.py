@@ -89,6 +89,8 @@ def test_the_spec_is_found_through_wrappers_and_processes() -> None:
         assert goal_spec_of(VectorWrapper(envs)) == spec
     with closing(AsyncVectorEnv([make_reach] * 2)) as apart:
         assert goal_spec_of(apart) == spec
+        assert declared(apart, "no_such_thing") is None
+        assert goal_spec_of(apart) == spec, "workers outlive a question that they have no answer to"
 
 
 def test_environments_without_goals_are_named() -> None:

@@ -136,7 +136,7 @@ class GoalVectorEnv(VectorEnv[Array, Array, Array], ABC):
     def _advance(self, actions: Array) -> None:
         """One step of all; ``actions`` are (num_envs, action_dim) in [-1, 1], or (num_envs,) numbers."""
 
-    def _seen(self) -> Floats:
+    def _seen(self) -> Array:
         """The state as it is observed, (num_envs, S)."""
         return self._state
 
@@ -221,7 +221,10 @@ class GoalVectorEnv(VectorEnv[Array, Array, Array], ABC):
         return tuple(self._canvas.frame(*self._drawn(env)) for env in range(self.num_envs))
 
     def _observations(self) -> Array:
-        return np.concatenate([self._seen(), self._goal], axis=1).astype(np.float32)
+        observations = np.empty((self.num_envs, self.goal_spec.obs_dim), dtype=np.float32)
+        state, goal = self.goal_spec.split(observations)
+        state[:], goal[:] = self._seen(), self._goal
+        return observations
 
     def _given(self, key: str, value: Any) -> Floats:
         try:

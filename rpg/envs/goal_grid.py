@@ -6,6 +6,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 from gymnasium.spaces import Discrete
+from numpy.typing import NDArray
 
 from rpg.envs.goal_batch import RANDOM, GoalVectorEnv, SingleGoalEnv
 from rpg.envs.grids import MOVES, boundaries, distances, steps
@@ -74,7 +75,7 @@ class FourRoomVectorEnv(GoalVectorEnv):
         self.free: Mask = np.array([[c == "." for c in row] for row in ROWS])
         self.cells: Integers = np.argwhere(self.free)
         """(56, 2) row and column of the free cells, in reading order."""
-        self.states = np.eye(_SIDE**2, dtype=np.float32)[self.free.ravel()]
+        self.states: NDArray[np.float32] = np.eye(_SIDE**2, dtype=np.float32)[self.free.ravel()]
         """(56, 121) how they are observed, as state and as goal."""
         self.wall_segments: Floats = boundaries(self.free) * (1.0, -1.0, 1.0, -1.0)
         """(n, 4) rows ``x0, y0, x1, y1``, y up: cell (row, column) has its centre at (column + .5, -row - .5)."""
@@ -110,8 +111,8 @@ class FourRoomVectorEnv(GoalVectorEnv):
     def _advance(self, actions: Integers) -> None:
         self._state[:, 0] = self._steps[self._state[:, 0].astype(np.int64), actions]
 
-    def _seen(self) -> Floats:
-        return self.states[self._state[:, 0].astype(np.int64)].astype(np.float64)
+    def _seen(self) -> NDArray[np.float32]:
+        return self.states[self._state[:, 0].astype(np.int64)]
 
     def _number(self, cells: Any, count: int) -> Integers:
         """Numbers (count,) of free cells, given by row and column."""
