@@ -65,7 +65,7 @@ class Agent:
     batch_size = 0
     horizon = 1
     takes_discrete = False
-    evaluations = (
+    evaluations: tuple[EvaluationMode, ...] = (
         EvaluationMode("deterministic", deterministic=True),
         EvaluationMode("stochastic", deterministic=False),
     )

@@ -14,7 +14,7 @@ _LARGEST = 1e3  # sensible inputs are of order one
 
 
 class DistanceCritic(nn.Module):
-    """d(s, a, g) >= 0, the steps that it takes to reach g from s when it begins with a.
+    """d(s, a, g) >= 0, the steps that it still takes to reach g from where a leads in s.
 
     Thesis and published code leave the sign of d open; a softplus makes it a distance.
 

@@ -172,9 +172,20 @@ class GoalAgent(Agent):
         """The policy's action where ``plain`` (n,), a random one where ``random`` (n,), else one with noise."""
         raise TypeError(f"{type(self).__name__} must define explore")
 
+    def beyond(self, state: Tensor, goal: Tensor) -> Tensor:
+        """d(s, a, g) (n,) of the policy's own action a, from states (n, S) to goals (n, G); no gradient."""
+        raise TypeError(f"{type(self).__name__} must define beyond")
+
+    @torch.no_grad()
     def distance(self, state: Tensor, goal: Tensor) -> Tensor:
-        """Steps (n,) from states (n, S) to goals (n, G) under the agent's own policy; no gradient."""
-        raise TypeError(f"{type(self).__name__} must define distance")
+        """Steps (n,) from states (n, S) to goals (n, G) under the agent's own policy.
+
+        d(s, a, g) counts from where (s, a) leads, as the anchor and the reward of 0 on arrival have it, so the
+        step itself comes on top. Without it a way over many near landmarks would cost nothing. None where the
+        goal is achieved already.
+        """
+        arrived = self.spec.arrived(self.spec.achieved_goal(state), goal)
+        return torch.where(arrived, 0.0, 1.0 + self.beyond(state, goal))
 
     # -- planning --------------------------------------------------------------------------------------
 

@@ -133,7 +133,7 @@ class GoalDDPG(GoalAgent):
         return torch.tanh(self.actor(inputs))
 
     @torch.no_grad()
-    def distance(self, state: Tensor, goal: Tensor) -> Tensor:
+    def beyond(self, state: Tensor, goal: Tensor) -> Tensor:
         """d(s, pi(s, g), g) in steps (n,); of two critics the larger."""
         inputs = scaled(self.spec.join(state, goal), self.config.obs_scale)
         far: Tensor = self.critic(torch.cat([inputs, self._policy(inputs)], dim=-1))[..., 0]

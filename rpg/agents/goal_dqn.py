@@ -102,7 +102,7 @@ class GoalDQN(GoalAgent):
         return torch.where((random & ~plain).unsqueeze(1), drawn, self.greedy(obs))
 
     @torch.no_grad()
-    def distance(self, state: Tensor, goal: Tensor) -> Tensor:
+    def beyond(self, state: Tensor, goal: Tensor) -> Tensor:
         """min_a d(s, a, g) in steps (n,)."""
         return self._steps(self.critic, self.spec.join(state, goal)).amin(-1)
 

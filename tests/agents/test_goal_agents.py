@@ -115,7 +115,8 @@ def test_learns_to_reach_any_goal_and_how_far_it_is(kind: str) -> None:
     assert np.corrcoef(far, way)[0, 1] > 0.9
     assert (far >= 0).all()
     least = (way / 0.2).round()
-    assert ((far - least).abs() < 2.0).float().mean() > 0.8
+    assert ((far - least).abs() < 1.0).float().mean() > 0.8
+    assert (far[way == 0] == 0).all()
     with agent.evaluating():
         for _ in range(STEPS):
             action = agent.act(obs, torch.zeros(121, 0), deterministic=True)
@@ -160,8 +161,8 @@ def test_of_two_critics_the_larger_distance_counts(kind: str) -> None:
     with torch.no_grad():
         getattr(net, "w3").zero_()  # noqa: B009
         net.b3.copy_(torch.tensor([1.0, 4.0]).view(2, 1, 1).expand_as(net.b3))
-    far = agent.distance(torch.rand(5, 2), torch.rand(5, 1))
-    torch.testing.assert_close(far, torch.nn.functional.softplus(torch.full((5,), 4.0)))
+    far = agent.distance(torch.rand(5, 2), torch.full((5, 1), -0.5))
+    torch.testing.assert_close(far, 1 + torch.nn.functional.softplus(torch.full((5,), 4.0)))
     assert np.isfinite(learn(agent, batches(agent, 3))[-1]["loss/value"])
 
 
@@ -372,7 +373,7 @@ def test_an_evaluation_builds_a_map_of_its_own_once() -> None:
 @BOTH
 def test_plans_over_a_real_map_after_practice(kind: str) -> None:
     agent = make(kind, MAP, arrival_ends=True, gamma=0.95)
-    practise(agent, 300)
+    practise(agent, 500)
     assert agent.planner is not None
     assert agent.planner.ready
     assert 0.3 < agent.report()["planner/share"] < 0.55
