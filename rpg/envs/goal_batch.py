@@ -58,7 +58,9 @@ def goal_reward(spec: GoalSpec, reward: str, observations: Array) -> tuple[Float
     state, goal = spec.split(observations)
     achieved = spec.achieved_goal(state)
     distance = np.linalg.norm(achieved - goal, axis=-1).astype(np.float64)
-    return (-distance if reward == "dense" else spec.arrived(achieved, goal) - 1.0), distance
+    if reward == "dense":
+        return -distance, distance
+    return np.asarray(spec.arrived(achieved, goal), dtype=np.float64) - 1.0, distance
 
 
 class GoalVectorEnv(VectorEnv[Array, Array, Array], ABC):

@@ -162,7 +162,8 @@ class _BlockedReach(MujocoFetchReachEnv):
         self._model_names = self._utils.MujocoModelNames(self.model)
         self._env_setup(initial_qpos=self.initial_qpos)
         self.initial_time = self.data.time
-        self.initial_qpos, self.initial_qvel = self.data.qpos.copy(), self.data.qvel.copy()
+        self.initial_qpos: Array = self.data.qpos.copy()
+        self.initial_qvel: Array = self.data.qvel.copy()
 
     def _sample_goal(self) -> Array:
         offset: Array = self.np_random.uniform(GOAL_LOW, GOAL_HIGH)
