@@ -42,7 +42,7 @@ class Streams:
         if isinstance(seed, int):
             seed = range(seed, seed + len(mask))
         known = mask & np.array([own is not None for own in seed])
-        seeds = np.array([0 if own is None else own % 2**64 for own in seed], dtype=np.uint64)
+        seeds = np.array([0 if own is None else int(own) % 2**64 for own in seed], dtype=np.uint64)
         self._state[known] = _mixed(seeds[known])  # neighbouring seeds begin far apart
 
     def uniform(self, rows: Integers, size: int) -> Floats:
