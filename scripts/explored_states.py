@@ -70,6 +70,7 @@ SCENES = {
     "maze": Scene((View("point", 0, 1),), ("x", "y")),
 }
 """By task; entries as in the tables of docs/envs."""
+_ANY = Scene((), ("", ""))
 
 
 def gather(folder: Path, entries: Sequence[int] | None = None) -> Path:
@@ -167,9 +168,11 @@ def draw(out: Path, runs: Sequence[tuple[str, str, int]]) -> None:
         )
     fig, axes = new_figure(len(recorded), _PHASES, width=2.4, height=2.5)
     for index, (task, method, seed, rows) in enumerate(recorded):
-        scene = SCENES.get(task, Scene((), ("", "")))
         panels = axes[index * _PHASES : (index + 1) * _PHASES]
         names = list(dict.fromkeys(row["view"] for row in rows))
+        scene = SCENES.get(task, _ANY)
+        if names != [view.name for view in scene.views]:  # entries that somebody asked for
+            scene = _ANY
         everything = np.array([(float(row["x"]), float(row["y"])) for row in rows])
         for phase, ax in enumerate(panels):
             own = [row for row in rows if int(row["phase"]) == phase]
@@ -212,7 +215,7 @@ def _frame(ax: Axes, points: FloatArray, scene: Scene) -> None:
     margin = 0.04 * (high - low) + 1e-3
     ax.set_xlim(low[0] - margin[0], high[0] + margin[0])
     ax.set_ylim(low[1] - margin[1], high[1] + margin[1])
-    if scene.axes[0][0] == "x" and scene.axes[1][0] in "yz":
+    if scene.axes[0].startswith("x") and scene.axes[1].startswith(("y", "z")):
         ax.set_aspect("equal", adjustable="box" if scene.cells else "datalim")
 
 
