@@ -22,7 +22,10 @@ from rpg.stats import FloatArray, iqm, stratified_bootstrap
 
 COUNTERS = ("decisions", "env_steps", "wall_s")
 MEASURES = ("success_end", "success_ever", "score", "return")
-COLUMNS = ("method", "agent", "exploration", "latent", "preset", "seed", *COUNTERS, *MEASURES)
+COLUMNS = (
+    "agent", "exploration", "latent", "preset", "seed", *COUNTERS, "success_end", "success_ever", "return", "versions",
+    "method", "score",
+)  # fmt: skip
 """Of ``curve.csv``. ``score`` is empty where the task has no measure of its own."""
 
 WINDOW = 20_000

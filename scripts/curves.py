@@ -67,8 +67,9 @@ def gather(task: str) -> Path:
         rows = [row for row in read_rows(log) if "train/return" in row]
         if rows:
             folder = log.parent
-            origins[f"{folder.parent.name}/{folder.name}"] = json.loads((folder / "run.json").read_text())
-            fresh += _rows(folder, rows)
+            origin = json.loads((folder / "run.json").read_text())
+            origins[f"{folder.parent.name}/{folder.name}"] = origin
+            fresh += _rows(folder, origin, rows)
     if not fresh:
         raise RPGError(f"{RUNS / task}: no run with a finished episode; start some with 'run {task}'")
     made = {(row["method"], str(row["seed"])) for row in fresh}
@@ -81,7 +82,7 @@ def gather(task: str) -> Path:
     return table
 
 
-def _rows(folder: Path, logged: Sequence[Any]) -> list[dict[str, Any]]:
+def _rows(folder: Path, origin: dict[str, Any], logged: Sequence[Any]) -> list[dict[str, Any]]:
     config: Any = OmegaConf.load(folder / "config.yaml")
     latent = ""
     if "latent" in config.agent:
@@ -90,6 +91,7 @@ def _rows(folder: Path, logged: Sequence[Any]) -> list[dict[str, Any]]:
     settings = {
         "method": folder.parent.name, "agent": config.agent.name, "exploration": config.exploration.name,
         "latent": latent, "preset": config.size.name, "seed": config.seed,
+        "versions": " ".join(f"{name}={version}" for name, version in origin.get("simulators", {}).items()),
     }  # fmt: skip
     rows = [
         {name: row[name] for name in COUNTERS} | {name: row.get(f"train/{name}") for name in MEASURES}

@@ -123,8 +123,8 @@ def test_table_is_read_back_by_method_and_seed(tmp_path: Path) -> None:
     table = tmp_path / "door" / "curve.csv"
     table.parent.mkdir()
     rows = [
-        "rpg_r,rpg,rnd,gaussian12,fast,1,20,40,3,1,1,,4",
-        "rpg_r,rpg,rnd,gaussian12,fast,1,10,20,2,0,0,,3",
+        "rpg,rnd,gaussian12,fast,1,20,40,3,1,1,4,mujoco=3.10.0,rpg_r,",
+        "rpg,rnd,gaussian12,fast,1,10,20,2,0,0,3,mujoco=3.10.0,rpg_r,",
     ]
     table.write_text("\n".join([",".join(COLUMNS), *rows]) + "\n")
     [run] = read_runs(table)
