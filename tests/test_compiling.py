@@ -17,6 +17,11 @@ from rpg.agents import (
     TDMPC,
     Agent,
     CEMConfig,
+    GoalAgent,
+    GoalDDPG,
+    GoalDDPGConfig,
+    GoalDQN,
+    GoalDQNConfig,
     PlannerConfig,
     PolicyConfig,
     RPGConfig,
@@ -31,6 +36,7 @@ from rpg.exploration import (
     RandomNetworkDistillation,
     RNDConfig,
 )
+from rpg.goals import GoalSpec
 from rpg.segments import SegmentBatch
 from rpg.training.replay import SegmentReplay
 
@@ -206,6 +212,48 @@ def test_baselines_compiled_and_plain_learn_the_same_and_nothing_compiles_twice(
     for i, (a, b) in enumerate(zip(expected, got, strict=True)):
         assert a.keys() == b.keys()
         for key in a.keys() - ({"action"} if name == "tdmpc" and i > 1 else set()):  # a search may tip over
+            torch.testing.assert_close(b[key], a[key], rtol=2e-3, atol=2e-4, msg=f"{key} at update {i}")
+
+
+def goal_agent(name: str) -> GoalAgent:
+    torch.manual_seed(0)
+    spec = GoalSpec(state_dim=2, achieved=(1,), relabel_radius=0.1, success_radius=0.1)
+    observations = gym.spaces.Box(-1.0, 1.0, (3,), np.float32)
+    sizes: dict[str, Any] = {"batch_size": BATCH, "width": 16, "hidden": 3, "critics": 2}
+    if name == "dqn":
+        return GoalDQN(observations, gym.spaces.Discrete(4), spec, GoalDQNConfig(double=True, **sizes))
+    config = GoalDDPGConfig(actor_width=16, target_noise=0.2, arrival_ends=True, **sizes)
+    return GoalDDPG(observations, gym.spaces.Box(-1.0, 1.0, (2,), np.float32), spec, config)
+
+
+def reach(agent: GoalAgent, steps: list[SegmentBatch], start: int = 0) -> list[dict[str, Any]]:
+    rows = []
+    for i, batch in enumerate(steps, start):
+        torch.manual_seed(i)
+        if isinstance(agent, GoalDQN):
+            batch = batch._replace(action=(2 * batch.action[..., :1] + 2).clamp(max=3.9).floor())
+        row = agent.update(batch._replace(reward=-(batch.reward < 0.8).float()), env_steps=i)
+        row["action"] = agent.act(batch.obs, batch.latent)
+        rows.append(row)
+    return rows
+
+
+@needs_compiler
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("name", ["ddpg", "dqn"])
+def test_goal_agents_compiled_and_plain_learn_the_same_and_nothing_compiles_twice(name: str) -> None:
+    compiling.LOG.failed.clear()
+    plain, compiled = goal_agent(name), goal_agent(name)
+    compiled.compile()
+    steps = list(batches(plain, 12))
+    expected = reach(plain, steps)
+    got = reach(compiled, steps[:2])
+    with torch.compiler.set_stance("fail_on_recompile"):
+        got += reach(compiled, steps[2:], start=2)
+    assert compiling.LOG.failed == {}
+    for i, (a, b) in enumerate(zip(expected, got, strict=True)):
+        assert a.keys() == b.keys()
+        for key in a:
             torch.testing.assert_close(b[key], a[key], rtol=2e-3, atol=2e-4, msg=f"{key} at update {i}")
 
 

@@ -68,12 +68,18 @@ def test_a_resumed_run_equals_an_uninterrupted_one(
     assert_equal_runs(tmp_path / "resumed", tmp_path / "straight")
 
 
-def test_evaluations_do_not_change_what_is_trained(composed: Composed, tmp_path: Path) -> None:
+@pytest.mark.parametrize("task", TASKS)
+def test_evaluations_and_pictures_do_not_change_what_is_trained(
+    composed: Composed, tmp_path: Path, task: str
+) -> None:
     losses = []
     for every in (0, 100):
-        cfg = composed(*SHORT, *TASKS["reach_2d"], *MAP, f"trainer.eval_every={every}")
+        intervals = (f"trainer.eval_every={every}", f"trainer.picture_every={every}")
+        cfg = composed(*SHORT, *TASKS[task], *MAP, *intervals)
         cfg.run_dir = str(tmp_path / f"every{every}")
         train(cfg)
+        pictures = sorted(path.name for path in (tmp_path / f"every{every}").glob("pictures/map_*.png"))
+        assert pictures == [f"map_{step:09d}.png" for step in ((100, 200, 300) if every else ())]
         found = read_rows(tmp_path / f"every{every}" / "metrics.jsonl")
         losses.append([row["loss/value"] for row in found if "loss/value" in row])
     assert len(losses[0]) > 2
