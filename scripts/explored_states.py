@@ -178,9 +178,8 @@ def draw(out: Path, runs: Sequence[tuple[str, str, int]]) -> None:
             own = [row for row in rows if int(row["phase"]) == phase]
             for order, name in enumerate(names):
                 points = [(float(row["x"]), float(row["y"])) for row in own if row["view"] == name]
-                ax.scatter(
-                    *np.array(points).reshape(-1, 2).T, s=2.5, color=color(order), linewidths=0, label=name
-                )
+                x, y = np.array(points).reshape(-1, 2).T
+                ax.scatter(x, y, s=2.5, color=color(order), linewidths=0, label=name)
             _frame(ax, everything, scene)
             begin, end = phases(int(rows[0]["decisions"]))[phase]
             span = f"{short_count(begin)} to {short_count(end)}" + ("" if own else ", dropped")
