@@ -177,7 +177,8 @@ def draw(out: Path, runs: Sequence[tuple[str, str, int]]) -> None:
         for phase, ax in enumerate(panels):
             own = [row for row in rows if int(row["phase"]) == phase]
             for order, name in enumerate(names):
-                x, y = ([float(row[axis]) for row in own if row["view"] == name] for axis in ("x", "y"))
+                points = [(float(row["x"]), float(row["y"])) for row in own if row["view"] == name]
+                x, y = np.array(points).reshape(-1, 2).T
                 ax.scatter(x, y, s=2.5, color=color(order), linewidths=0, label=name)
             _frame(ax, everything, scene)
             begin, end = phases(int(rows[0]["decisions"]))[phase]
