@@ -78,12 +78,13 @@ def test_walls_and_platforms_fill_their_cells_and_no_others(name: str) -> None:
         offsets = np.random.default_rng(0).uniform(-0.49, 0.49, (20, 2)) * cells.cell
         index = np.argwhere(np.ones(cells.shape, dtype=bool))
         points = (cells.centres(index)[:, None] + offsets).reshape(-1, 2)
-        for kind, mask, bottom in (
-            ("wall", cells.walls, cells.floor_height),
-            ("floor", ~cells.chasms & cells.chasms.any(), 0.0),
+        floor = cells.floor_height
+        for kind, mask, bottom, top in (
+            ("wall", cells.walls, floor, floor + cells.wall_height),
+            ("floor", ~cells.chasms & cells.chasms.any(), 0.0, floor),
         ):
             expected = mask.ravel().repeat(20)
-            for height, inside in ((bottom + 0.1, True), (bottom + 3.9, True), (bottom + 4.1, False)):
+            for height, inside in ((bottom + 0.1, True), (top - 0.1, True), (top + 0.1, False)):
                 at = np.column_stack([points, np.full(len(points), height)])
                 np.testing.assert_array_equal(covered(env, kind, at), expected & inside)
 
