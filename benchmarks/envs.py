@@ -34,35 +34,27 @@ from rpg.training.build import env_preset
 
 COLUMNS = ["task", "workers", "raw_steps_s", "ours_steps_s", "overhead_pct", "overhead_us", "versions"]
 Stepper = Callable[[np.ndarray], object]
+Raw = tuple[Stepper, Callable[[], object]]  # a simulator's step and its reset
 
 
-def suite(env_id: str, **kwargs: Any) -> Callable[[gym.Env[Any, Any]], Stepper]:
-    """The unwrapped environment of a suite, reset as often as ours."""
+def suite(env_id: str, **kwargs: Any) -> Callable[[gym.Env[Any, Any]], Raw]:
+    """The unwrapped environment of a suite."""
 
-    def make(ours: gym.Env[Any, Any]) -> Stepper:
+    def make(ours: gym.Env[Any, Any]) -> Raw:
         raw = gym.make(env_id, **kwargs).unwrapped
-        raw.reset(seed=0)
-        return raw.step
+        return raw.step, raw.reset
 
     return make
 
 
-def metaworld(ours: gym.Env[Any, Any]) -> Stepper:
+def metaworld(ours: gym.Env[Any, Any]) -> Raw:
     """The task's own environment, made a second time."""
     assert ours.spec is not None
     twin: Any = gym.make(ours.spec.id, **ours.spec.kwargs).unwrapped
-    twin.reset(seed=0)
-    simulation = twin.simulation
-
-    def step(action: np.ndarray) -> object:
-        if simulation.curr_path_length >= simulation.max_path_length:
-            twin.reset()
-        return simulation.step(action)
-
-    return step
+    return twin.simulation.step, twin.reset
 
 
-def mujoco_state(ours: gym.Env[Any, Any]) -> Stepper:
+def mujoco_state(ours: gym.Env[Any, Any]) -> Raw:
     """MuJoCo's own step on the model of a task, and positions and velocities as one array."""
     import mujoco
 
@@ -74,10 +66,10 @@ def mujoco_state(ours: gym.Env[Any, Any]) -> Stepper:
         mujoco.mj_step(model, data, 5)
         return np.concatenate([data.qpos, data.qvel])
 
-    return step
+    return step, lambda: mujoco.mj_resetData(model, data)
 
 
-RAW: dict[str, Callable[[gym.Env[Any, Any]], Stepper]] = {
+RAW: dict[str, Callable[[gym.Env[Any, Any]], Raw]] = {
     "adroit_door": suite("AdroitHandDoor-v1"),
     "adroit_hammer": suite("AdroitHandHammer-v1"),
     "metaworld_basketball": metaworld,
@@ -91,6 +83,24 @@ RAW: dict[str, Callable[[gym.Env[Any, Any]], Stepper]] = {
     "mujoco_humanoid": suite("Humanoid-v5"),
 }
 OTHERS = ("block_push", "visual_block_push", "cabinet_dense", "cabinet_sparse")  # have no step but ours
+
+
+def in_episodes(raw: Raw, length: int) -> Stepper:
+    """The step of a simulator that is reset after ``length`` steps, or where it says that an episode ended."""
+    step, reset = raw
+    reset()
+    taken = 0
+
+    def go_on(action: np.ndarray) -> object:
+        nonlocal taken
+        out = step(action)
+        taken += 1
+        if taken == length or (isinstance(out, tuple) and out[2]):
+            reset()
+            taken = 0
+        return out
+
+    return go_on
 
 
 def per_second(step: Stepper, actions: np.ndarray) -> float:
@@ -114,7 +124,9 @@ def alone(task: str, config: EnvConfig, decisions: int, repeats: int) -> dict[st
                 env.reset()
             return out
 
-        raw = RAW[task](env) if task in RAW else None
+        assert env.spec is not None
+        length = (env.spec.max_episode_steps or sys.maxsize) * config.action_repeat
+        raw = in_episodes(RAW[task](env), length) if task in RAW else None
         times: dict[str, list[float]] = {"ours": [], "raw": []}
         for _ in range(repeats + 1):  # the first warms up
             times["ours"].append(per_second(ours, actions) * config.action_repeat)
