@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from rpg.envs.checks import checked_action
 from rpg.envs.goal_batch import checked_horizon, checked_reward, goal_reward
+from rpg.envs.mujoco.ant import numbers
 from rpg.envs.mujoco_picture import PicturedSimulation, View
-from rpg.errors import NonFiniteError, RPGError
+from rpg.errors import NonFiniteError
 from rpg.exploration.objects import ObjectsOfInterest
 from rpg.goals import GoalSpec
 
@@ -99,10 +100,7 @@ class FetchTask(PicturedSimulation):
         self.simulation.np_random = self.np_random
         observation, _ = self.simulation.reset()
         if options and "goal" in options:
-            goal = np.asarray(options["goal"], dtype=np.float64)
-            if goal.shape != (3,) or not np.isfinite(goal).all():
-                raise RPGError(f"{self.name}: goal {options['goal']!r} must be three finite numbers")
-            self.simulation.goal = goal
+            self.simulation.goal = np.array(numbers(self.name, "goal", options["goal"], (3,)))
         self.model.site_pos[self._site] = self.simulation.goal - self._site_origin
         self._elapsed = 0
         return self._flat(observation["observation"]), {}

@@ -64,10 +64,10 @@ def distances(free: Mask) -> Integers:
     """
     neighbours = steps(free)
     away = np.full((len(neighbours), len(neighbours)), -1, dtype=np.int64)
-    reached = np.eye(len(neighbours), dtype=np.bool_)
+    reached: Mask = np.eye(len(neighbours), dtype=np.bool_)
     step = 0
     while (new := reached & (away < 0)).any():
         away[new] = step
         step += 1
-        reached = new[:, neighbours].any(axis=-1)  # steps can be taken back, so from a neighbour
+        reached = np.asarray(new[:, neighbours].any(axis=-1))  # steps can be taken back, so from a neighbour
     return away

@@ -41,18 +41,16 @@ class Streams:
             return
         if isinstance(seed, int):
             seed = range(seed, seed + len(mask))
-        for row in np.flatnonzero(mask):
-            if (own := seed[int(row)]) is not None:
-                self._state[row] = np.uint64(own % 2**64)
-        known = np.array([own is not None for own in seed]) & mask
-        self._state[known] = _mixed(self._state[known])  # neighbouring seeds begin far apart
+        known = mask & np.array([own is not None for own in seed])
+        seeds = np.array([0 if own is None else int(own) % 2**64 for own in seed], dtype=np.uint64)
+        self._state[known] = _mixed(seeds[known])  # neighbouring seeds begin far apart
 
     def uniform(self, rows: Integers, size: int) -> Floats:
         """Numbers in [0, 1), (len(rows), size), of the streams ``rows``, none of them named twice."""
         ahead = np.arange(1, size + 1, dtype=np.uint64) * _STEP
         bits = _mixed(self._state[rows, None] + ahead)
-        self._state[rows] += np.uint64(size) * _STEP
-        return (bits >> np.uint64(11)) * 2.0**-53
+        self._state[rows] += ahead[-1]
+        return (bits >> np.uint64(11)).astype(np.float64) * 2.0**-53
 
     def where(self, rows: Integers, low: Floats, high: Floats, accept: Callable[[Floats], Mask]) -> Floats:
         """Places (len(rows), d), each uniform among those between ``low`` and ``high`` (d,) that are accepted.

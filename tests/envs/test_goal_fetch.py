@@ -101,7 +101,7 @@ def test_fetch_push_is_that_of_gymnasium_robotics_with_a_tighter_threshold() -> 
             env.reset(seed=3, options={"goal": block + np.array([gap, 0.0, 0.0])})
             _, value, _, _, info = env.step(np.zeros(4))
             assert (value, info["success"]) == (reward, reward == 0)
-        with pytest.raises(RPGError, match="goal 'there' must be three finite numbers"):
+        with pytest.raises(RPGError, match="goal 'there' must be 3 finite numbers"):
             env.reset(options={"goal": "there"})
 
 
