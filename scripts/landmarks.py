@@ -43,7 +43,7 @@ _DISTANCES = [*_RUN, "distortion", "max_distance"]
 
 def jobs_of(args: argparse.Namespace) -> list[Job]:
     """One run for each method and seed; in environments whose planner has no share in exploring one is enough."""
-    label = "".join(f",{text}" for text in args.set)
+    label = f",{args.label}" if args.label else "".join(f",{text}" for text in args.set)
     agent = "dqn_her" if args.env in _DISCRETE else "ddpg_her"
     common = [f"agent={agent}", f"env={_PRESETS.get(args.env, args.env)}", f"size={args.size}"]
     common += [f"trainer.steps={args.steps}"] if args.steps else []
@@ -186,6 +186,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--steps", type=int, help="env steps; default: those of the config")
     parser.add_argument("--stop", default="0.95", help="success that ends a run, or none")
     parser.add_argument("--set", nargs="+", default=[], help="more overrides: planner.tau=6 ...")
+    parser.add_argument("--label", help="name of the runs' folder instead of these overrides")
     parser.add_argument("--jobs", type=int, default=2, help="runs side by side")
     parser.add_argument("--threads", type=int, default=1)
     args = parser.parse_args(argv)

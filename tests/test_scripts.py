@@ -124,7 +124,7 @@ def test_landmark_runs_are_gathered_by_method_and_drawn(tmp_path: Path) -> None:
         "trainer.eval_episodes=1", "trainer.eval_envs=1", "trainer.picture_every=0", "trainer.log_every=100",
         "planner.landmarks=8", "planner.candidates=20", "+env.kwargs.episode_steps=10",
     ]  # fmt: skip
-    words = ("run", "four_room", "--steps", "200", "--stop", "none", "--set", *small)
+    words = ("run", "four_room", "--steps", "200", "--stop", "none", "--label", "tiny", "--set", *small)
     assert run(tmp_path, script, *words).splitlines() == ["four_room planner seed 0: done"]
     # A run that explored with its planner, which is not trained for real.
     folder = next((tmp_path / "runs" / "landmarks" / "four_room").glob("planner*/seed0"))

@@ -94,6 +94,21 @@ def test_a_trained_run_is_judged_with_the_map_of_its_replay(composed: Composed, 
     assert evaluate_run(tmp_path / "run", 2, seed=5) == first
 
 
+@pytest.mark.long
+def test_finds_its_way_through_four_rooms(composed: Composed, tmp_path: Path) -> None:
+    cfg = composed(
+        *TASKS["four_room"][:2], "planner=landmarks", "compile=false", "trainer.steps=16000",
+        "trainer.eval_every=4000", "trainer.eval_episodes=100", "trainer.eval_envs=100",
+        "+env.eval_kwargs.episode_steps=40", "trainer.picture_every=8000",
+    )  # fmt: skip
+    row = train(cfg)
+    found = [row for row in read_rows(tmp_path / "run" / "metrics.jsonl") if "eval/her/distortion" in row]
+    for mode in ("planner", "her"):
+        assert row[f"eval/{mode}/success_ever"] > 0.9, found
+        assert row[f"eval/{mode}/distortion"] < 0.25, found
+        assert found[0][f"eval/{mode}/distortion"] > 2 * row[f"eval/{mode}/distortion"]
+
+
 # -- stopping early ------------------------------------------------------------------------------------
 
 
