@@ -44,28 +44,29 @@ def draw_curves(
     measure: str = "success_end",
     published: Published | None = None,
     whole: int | None = None,
-    labelled: bool = True,
 ) -> None:
-    """Draw the methods of one task.
+    """Draw the methods of one task; in brackets its title has the seeds of each, in the order of the legend.
 
     Args:
         axes: the panel against decisions, and the one against wall-clock time.
         title: of the first.
-        runs: by method; one without runs keeps its colour free.
+        runs: by method; one without runs has its colour and its place in the legend all the same.
         measure: what is drawn, see :data:`rpg.curves.MEASURES`.
         published: thin dotted lines in the colours of the methods.
         whole: end of the axis of decisions; where the runs end if None.
-        labelled: whether the seeds of each are told in a legend of the panel.
     """
     longest = 1.0
     for index, (method, members) in enumerate(runs.items()):
-        if members:
-            band = aggregate(members, measure)
-            edges = (band.point, band.low, band.high)
-            label = f"{label_of(method)} ({band.seeds})" if labelled else str(band.seeds)
-            curve(axes[0], band.decisions, *edges, label=label, index=index)
-            curve(axes[1], band.wall_s, *edges, index=index)
-            longest = max(longest, float(band.wall_s[-1]))
+        stands_for = f", dotted: {label_of(STAND_INS[method])}" if method in STAND_INS else ""
+        label = label_of(method) + stands_for
+        if not members:
+            curve(axes[0], [], [], label=label, index=index)
+            continue
+        band = aggregate(members, measure)
+        edges = (band.point, band.low, band.high)
+        curve(axes[0], band.decisions, *edges, label=label, index=index)
+        curve(axes[1], band.wall_s, *edges, index=index)
+        longest = max(longest, float(band.wall_s[-1]))
     for method, points in (published or {}).items():
         ours = next((name for name in runs if method in (name.split(",")[0], STAND_INS.get(name))), None)
         index = list(runs).index(ours) if ours else len(runs)
@@ -73,9 +74,11 @@ def draw_curves(
             len(points) == 1
         ):  # of its end alone a short line is drawn, which claims nothing of how it came there
             points = [(round(0.9 * points[0][0]), points[0][1]), *points]
-        curve(axes[0], *zip(*points, strict=True), index=index, reference=True)
+        label = "" if ours else f"{label_of(method)}, published"
+        curve(axes[0], *zip(*points, strict=True), label=label, index=index, reference=True)
     success = measure != "return"
-    style_axes(axes[0], ylabel="success at the end" if success else "return", title=title)
+    seeds = ", ".join(str(len(members)) for members in runs.values())
+    style_axes(axes[0], ylabel="success at the end" if success else "return", title=f"{title} ({seeds})")
     style_axes(axes[1])
     steps_axis(axes[0], "decisions")
     time_axis(axes[1], longest)

@@ -39,7 +39,7 @@ from rpg.budget import within_budget
 from rpg.cli import report_errors
 from rpg.curves import RecordedRun, read_runs
 from rpg.errors import RPGError, nearest
-from rpg.figures import new_figure, save
+from rpg.figures import legend, new_figure, save
 
 FIGURES: dict[str, tuple[str, tuple[str, ...]]] = {
     "fig3_4": ("the bandit, learned by the agents of the other figures", ("fig3_4",)),
@@ -225,12 +225,11 @@ def _draw_curves(name: str, label: str, out: Path) -> None:
     for column, (panel, runs) in enumerate(zip(panels, recorded, strict=True)):
         measure, title = MEASURES.get(name, "success_end"), panel.task
         if panel.task == "block_push" and all(run.scored for each in runs.values() for run in each):
-            measure, title = "score", "block_push, blocks in place / 2"
+            measure, title = "score", "block_push, blocks / 2"
         pair = axes[column], axes[len(panels) + column]
         published = published_points(panel.task)
         draw_curves(pair, title, runs, measure, published, panel.decisions)
-        if pair[0].get_legend_handles_labels()[0]:
-            pair[0].legend(loc="upper left", frameon=False, fontsize=6.5)
+    legend(fig, axes[0], columns=len(panels[0].methods) + 1, place="lower")
     fig.suptitle(told(panels, recorded), fontsize=8.5, x=0.01, ha="left")
     save(fig, out, dpi=130)
 
