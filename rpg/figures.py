@@ -8,7 +8,7 @@ from __future__ import annotations
 import io
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import matplotlib
 import numpy as np
@@ -153,13 +153,13 @@ def time_axis(ax: Axes, longest_s: float, label: str = "wall-clock time") -> Non
     ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value / size:g}"))
 
 
-def legend(fig: Figure, ax: Axes, columns: int = 4, place: str = "upper") -> None:
+def legend(fig: Figure, ax: Axes, columns: int = 4, place: Literal["upper", "lower"] = "upper") -> None:
     """Put the names of the curves of ``ax`` above (``upper``) or below (``lower``) all panels: they hide nothing."""
     handles, labels = ax.get_legend_handles_labels()
     fig.legend(
         handles,
         labels,
-        loc=f"outside {place} left",
+        loc="outside upper left" if place == "upper" else "outside lower left",
         ncols=max(1, min(columns, len(labels))),
         frameon=False,
         fontsize=8.5,
