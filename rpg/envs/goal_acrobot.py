@@ -89,7 +89,7 @@ def record_swings() -> Swings:
         action = 1 + np.sign(state[:, 3]).astype(np.int64)
         chance = rng.uniform(size=_BANK_COPIES) < _BANK_RANDOM
         action = np.where(chance, rng.integers(0, 3, _BANK_COPIES), action)
-        state = swing(state, action - 1.0)
+        state = swing(state, action.astype(np.float64) - 1.0)
         states.append(state)
         actions.append(action)
     return Swings(np.stack(states), np.stack(actions))
@@ -154,7 +154,7 @@ class AcrobotGoalVectorEnv(GoalVectorEnv):
         self._goal[rows] = bank[(drawn[:, 4] * len(bank)).astype(np.int64)] if goal is None else goal
 
     def _advance(self, actions: Integers) -> None:
-        self._state = swing(self._state, actions - 1.0)
+        self._state = swing(self._state, actions.astype(np.float64) - 1.0)
 
     def _seen(self) -> Floats:
         return observed(self._state)

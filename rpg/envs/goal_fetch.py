@@ -147,6 +147,8 @@ class FetchPushEnv(FetchTask):
 class _BlockedReach(MujocoFetchReachEnv):
     """FetchReach among boxes, with goals behind them."""
 
+    initial_qpos: Any  # a dictionary of joints before, positions after the simulation was made
+
     def _initialize_simulation(self) -> None:
         scene = mujoco.MjSpec.from_file(self.fullpath)
         for number, (centre, half) in enumerate(BLOCKS):
