@@ -65,6 +65,10 @@ def make_envs(
             f"environment '{config.id}': its package is not installed ({error}); pip install {error.name}"
         ) from error
     except TypeError as error:
+        if "'render_mode'" in str(error):
+            raise RPGError(
+                f"environment '{config.id}': draws no pictures; leave videos off (trainer.video_every=0)"
+            ) from error
         raise RPGError(
             f"environment '{config.id}': env.kwargs={config.kwargs} do not fit: {error}"
         ) from error

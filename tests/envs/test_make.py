@@ -137,3 +137,8 @@ def test_evaluation_settings_are_merged_over_the_others() -> None:
     for chosen, steps in ((config, 9), (tested, 4)):
         envs: Any = make_envs(chosen, 1)
         assert envs.episode_steps == steps
+
+
+def test_asking_for_pictures_where_there_are_none_is_refused_in_one_line() -> None:
+    with pytest.raises(RPGError, match="rpg/Bandit-v0': draws no pictures; leave videos off"):
+        make_envs(EnvConfig(name="bandit", id="rpg/Bandit-v0"), 1, render=True)
