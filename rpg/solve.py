@@ -151,7 +151,7 @@ def solve(cfg: DictConfig) -> dict[str, Any]:
             write_atomic(folder / "result.json", json.dumps(result, indent=2).encode())
             note_outcome(folder, env_steps=run.solver.iterations)
             progress.note(
-                f"done: {run.solver.iterations} iterations, {run.wall_s:.0f} s, best loss {run.solver.best_loss:.4g}, "
+                f"done: {run.solver.iterations} iterations, {run.wall_s:.0f} s, loss {run.solver.best_loss:.4g}, "
                 f"score {result['score']:.3f} under hard contact; results in {folder}"
             )
     return result
@@ -162,7 +162,8 @@ def _iterate(run: Run, progress: Progress, stopped_by: Any) -> None:
     while run.solver.iterations < run.config.iterations and not stopped_by():
         row = run.iterate()
         shown = {key: row[key] for key in ("loss", "score", "gradient_norm")}
-        progress.update(row["episode"], row["episode"], shown | {"best": run.solver.best_loss})
+        best = run.solver.best_loss if run.config.keep == "loss" else run.solver.best_score
+        progress.update(row["episode"], row["episode"], shown | {"best": best})
         if time.perf_counter() - saved > _SAVE_EVERY_S:
             run.save()
             saved = time.perf_counter()

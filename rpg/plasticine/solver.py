@@ -13,6 +13,8 @@ from rpg.plasticine.scene import Scene
 
 Method = Literal["adam", "gd", "adam_hard"]
 METHODS = ("adam", "gd", "adam_hard")
+Criterion = Literal["loss", "score"]
+CRITERIA = ("loss", "score")
 
 _MOMENTUM = 0.9
 _NORMS_KEPT = 20
@@ -31,6 +33,9 @@ class SolverConfig:
         horizon: environment steps of a sequence.
         init_scale: actions begin uniform in [-init_scale, init_scale].
         starts: sequences optimised side by side from different beginnings; the best one counts.
+        keep: which sequence is the result: that of the lowest loss, as published, or of the highest score under hard
+            contact, which costs a rollout without gradient an iteration. The loss sums over the episode and the score
+            looks at its end, so they disagree.
         clip: a gradient's norm is cut to this many times the median of the last 20; None never cuts.
         seed: of the beginnings.
     """
@@ -42,12 +47,15 @@ class SolverConfig:
     horizon: int = 50
     init_scale: float = 1e-4
     starts: int = 1
+    keep: Criterion = "loss"
     clip: float | None = 100.0
     seed: int = 0
 
     def __post_init__(self) -> None:
         if self.optimizer not in METHODS:
             raise RPGError(f"optimizer={self.optimizer!r}: unknown; {nearest(str(self.optimizer), METHODS)}")
+        if self.keep not in CRITERIA:
+            raise RPGError(f"keep={self.keep!r}: unknown; {nearest(str(self.keep), CRITERIA)}")
         for name in ("lr", "iterations", "horizon", "starts"):
             if not getattr(self, name) > 0:
                 raise RPGError(f"{name}={getattr(self, name)}: must be positive")
@@ -60,11 +68,12 @@ class SolverConfig:
 
 
 class Iteration(NamedTuple):
-    """What one iteration saw; of several starts, that of the lowest loss.
+    """What one iteration saw; of several starts, the one that is best by what decides which sequence is kept.
 
     Attributes:
         loss: sum of the losses of all steps.
-        score: normalised incremental IoU after the last step, under the contact that was optimised.
+        score: normalised incremental IoU after the last step, under hard contact where that decides, else under the
+            contact that was optimised.
         gradient_norm: before clipping.
         clipped: starts whose gradient was cut back.
         skipped: starts whose gradient was not finite, and which kept their actions.
@@ -78,7 +87,7 @@ class Iteration(NamedTuple):
 
 
 class Solver:
-    """Optimises open-loop actions (starts, horizon, action_dim) in [-1, 1]; keeps the sequence of the lowest loss.
+    """Optimises open-loop actions (starts, horizon, action_dim) in [-1, 1] and keeps the best sequence that it saw.
 
     Args:
         scene: whose loss is summed over the steps.
@@ -102,7 +111,7 @@ class Solver:
         self._norms: list[deque[float]] = [deque(maxlen=_NORMS_KEPT) for _ in range(config.starts)]
         self._skipped_in_a_row = 0
         self.iterations = 0
-        self.best_loss = float("inf")
+        self.best_loss, self.best_score = float("inf"), -float("inf")
         self.best_actions = begin[0].clone()
 
     def step(self) -> Iteration:
@@ -119,11 +128,7 @@ class Solver:
         self._optimizer.zero_grad()
         losses.sum().backward()
         assert self.actions.grad is not None
-        seen = losses.detach()
-        best = int(seen.argmin())
-        if float(seen[best]) < self.best_loss:
-            self.best_loss = float(seen[best])
-            self.best_actions = self.actions.detach()[best].cpu().clone()
+        best, loss, score = self._judge(losses.detach(), rollout.score.detach())
         norms = self.actions.grad.flatten(1).norm(dim=1)
         clipped, skipped = self._tame(self.actions.grad, norms)
         kept = [start for start in range(config.starts) if not norms[start].isfinite()]
@@ -139,8 +144,24 @@ class Solver:
             self.actions[kept] = before  # momentum would move them
             self.actions.clamp_(-1.0, 1.0)
         self.iterations += 1
-        score = float(rollout.score.detach()[best])
-        return Iteration(float(seen[best]), score, float(norms[best]), clipped, skipped)
+        return Iteration(loss, score, float(norms[best]), clipped, skipped)
+
+    def _judge(self, losses: torch.Tensor, scores: torch.Tensor) -> tuple[int, float, float]:
+        """Which start is best now, its loss and its score; keep its actions if none was better before."""
+        actions = self.actions.detach()
+        by_score = self.config.keep == "score"
+        if by_score:
+            if self._softness is None:
+                with torch.no_grad():
+                    scores = self.scene.rollout(actions, softness=0.0).score
+            best = int(scores.argmax())
+        else:
+            best = int(losses.argmin())
+        loss, score = float(losses[best]), float(scores[best])
+        if score > self.best_score if by_score else loss < self.best_loss:
+            self.best_loss, self.best_score = loss, score
+            self.best_actions = actions[best].cpu().clone()
+        return best, loss, score
 
     def _lr(self) -> float:
         config = self.config
@@ -173,6 +194,7 @@ class Solver:
             "norms": [list(kept) for kept in self._norms],
             "iterations": self.iterations,
             "best_loss": self.best_loss,
+            "best_score": self.best_score,
             "best_actions": self.best_actions,
         }
 
@@ -183,7 +205,8 @@ class Solver:
         self._optimizer.load_state_dict(state["optimizer"])
         self._norms = [deque(kept, maxlen=_NORMS_KEPT) for kept in state["norms"]]
         self.iterations = state["iterations"]
-        self.best_loss, self.best_actions = state["best_loss"], state["best_actions"]
+        self.best_loss, self.best_score = state["best_loss"], state["best_score"]
+        self.best_actions = state["best_actions"]
 
 
 def hard_score(scene: Scene, actions: torch.Tensor) -> float:

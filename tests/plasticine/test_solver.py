@@ -91,6 +91,27 @@ def test_of_several_starts_the_best_counts(scene: Scene) -> None:
     assert solver.best_actions.shape == (HORIZON, scene.action_dim)
 
 
+def test_the_highest_score_under_hard_contact_can_decide() -> None:
+    scene = load_scene("writer", particles=200, grid=32)
+    settings = {"starts": 2, "init_scale": 0.5, "lr": 0.3, "keep": "score", "horizon": 12}
+    solver, seen = run(scene, 5, **settings)
+    with torch.no_grad():
+        first = scene.rollout(Solver(scene, solver.config).actions, softness=0.0).score
+    assert first[0] != first[1]
+    assert seen[0].score == pytest.approx(float(first.max()), abs=1e-6)
+    scores = [row.score for row in seen]
+    assert solver.best_score == max(scores)
+    assert solver.best_loss == seen[scores.index(max(scores))].loss
+    assert hard_score(scene, solver.best_actions) == pytest.approx(max(scores), abs=1e-6)
+    # The search itself is the same; only what is kept differs.
+    by_loss, _ = run(scene, 5, **settings | {"keep": "loss"})
+    assert torch.equal(by_loss.actions, solver.actions)
+    assert by_loss.best_loss <= solver.best_loss
+    second = Solver(scene, solver.config)
+    second.load_state_dict(solver.state_dict())
+    assert second.best_score == solver.best_score
+
+
 def test_the_learning_rate_falls_to_its_last_value(scene: Scene) -> None:
     solver = Solver(scene, SolverConfig(horizon=1, iterations=4, lr=0.2, lr_final=0.1))
     rates = []
@@ -140,6 +161,7 @@ def test_a_solver_that_never_sees_a_finite_gradient_gives_up(scene: Scene) -> No
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
+        ({"keep": "scor"}, "keep=.scor.: unknown; did you mean .score."),
         ({"optimizer": "adm"}, "optimizer='adm': unknown; did you mean 'adam'"),
         ({"lr": 0.0}, "lr=0.0: must be positive"),
         ({"iterations": 0}, "iterations=0: must be positive"),
