@@ -21,6 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from growing_table import Table
 from side_by_side import Job, run_side_by_side
@@ -49,7 +50,7 @@ class OurJob(Job):
     def command(self) -> list[str]:
         """With evaluations, which other experiments go without."""
         return [
-            sys.executable, "-m", "rpg.train", "agent=sac", "env=gymnasium", f"env.id={ENV}", "env.num_envs=1",
+            sys.executable, "-m", "rpg.train", "agent=sac", "env=gymnasium", f"id={ENV}", "env.num_envs=1",
             "size=paper", "exploration=none", "agent.observation_frequencies=0", "trainer.decisions_per_update=1",
             f"trainer.seed_decisions={SEED_STEPS}", f"trainer.eval_every={EVERY}",
             f"trainer.eval_episodes={EPISODES}", f"trainer.eval_envs={EPISODES}", "trainer.picture_every=0",
@@ -92,7 +93,9 @@ def learn(seed: int, steps: int, folder: Path) -> None:
         agent.learn(EVERY, reset_num_timesteps=done == EVERY)
         judge.seed(seed + _EVALUATION_SEED)
         value, _ = evaluate_policy(agent, judge, EPISODES, deterministic=True)
-        rows.append({"env_steps": done, "return": float(value), "wall_s": time.perf_counter() - begin})
+        rows.append(
+            {"env_steps": done, "return": float(np.mean(value)), "wall_s": time.perf_counter() - begin}
+        )
     write_atomic(folder / "evaluations.json", json.dumps(rows).encode())
     write_atomic(folder / "run.json", json.dumps(provenance(), indent=2).encode())
 

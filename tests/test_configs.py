@@ -22,11 +22,12 @@ Composed = Callable[..., DictConfig]
 
 CONF = Path(rpg.conf.__file__).parent
 AGENTS = sorted(p.stem for p in (CONF / "agent").glob("*.yaml"))
-# Variants are RPG's alone, methods choose the agent themselves; both are tested with their figures.
+# Variants are RPG's alone, methods choose the agent themselves; both are tested with their figures. Task ids belong to
+# their adapters.
 OPTIONS = sorted(
     (p.parent.name, p.stem)
     for p in CONF.glob("*/*.yaml")
-    if p.parent.name not in ("agent", "ablation", "method") and not p.stem.startswith("fig3")
+    if p.parent.name not in ("agent", "ablation", "method", "task_id") and not p.stem.startswith("fig3")
 )
 GOALS = ["ddpg_her", "dqn_her"]  # run in environments of their own, tests/training/test_goal_training.py
 # What tells from a log row that an agent learned.
@@ -116,7 +117,7 @@ def test_environment_settings_reach_the_agent(composed: Composed) -> None:
 def test_environments_in_the_configs_are_registered_or_need_a_package() -> None:
     register_all()
     for path in sorted((CONF / "env").glob("*.yaml")):
-        env_id = str(OmegaConf.load(path).id)  # type: ignore[union-attr]
+        env_id = str(OmegaConf.to_container(OmegaConf.load(path), resolve=False)["id"])  # type: ignore[index,call-overload]
         if env_id.startswith("rpg/"):
             assert env_id in gymnasium.registry, path.name
 
@@ -154,3 +155,14 @@ def test_every_learner_runs_without_and_with_the_other_bonus(composed: Composed,
     bare = train(other)
     assert LEARNERS[agent] in bare
     assert {"loss/ensemble", "loss/rnd"}.isdisjoint(bare)
+
+
+@pytest.mark.parametrize(
+    ("env", "task"),
+    [("gymnasium", "Hopper-v5"), ("gymnasium_robotics", "FetchPush-v4"), ("metaworld", "door-open-v3"),
+     ("maniskill", "PushCube-v1")],
+)  # fmt: skip
+def test_adapters_take_their_task_at_the_top_of_the_config(composed: Composed, env: str, task: str) -> None:
+    config = parse_config(composed(f"env={env}", f"id={task}")).env
+    assert config.name == task
+    assert task in (config.id, config.kwargs.get("task"))
