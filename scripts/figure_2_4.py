@@ -3,7 +3,8 @@
     python scripts/figure_2_4.py        # results/plasticine/curves.csv -> results/plasticine/figure_2_4.png
 
 A line is the mean over variants and seeds of the score (normalised incremental IoU) after so many iterations, one
-episode each, and its band one standard deviation. It is the score under the contact that was optimised.
+episode each, and its band one standard deviation. It is the score under the contact that was optimised, but with a falling learning rate under hard contact,
+by which that method chooses.
 """
 
 from __future__ import annotations
@@ -20,7 +21,12 @@ from rpg.errors import RPGError
 from rpg.figures import curve, legend, new_figure, save, style_axes
 
 _TABLE = Path("results/plasticine/curves.csv")
-_METHODS = {"adam": "Adam", "gd": "gradient descent", "adam_hard": "Adam, hard contact"}
+_METHODS = {
+    "adam": "Adam",
+    "gd": "gradient descent",
+    "adam_hard": "Adam, hard contact",
+    "adam_decay": "Adam, falling rate",
+}
 _COLS = 5
 
 Runs = dict[tuple[str, str], dict[int, float]]
