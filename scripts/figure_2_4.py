@@ -3,8 +3,8 @@
     python scripts/figure_2_4.py        # results/plasticine/curves.csv -> results/plasticine/figure_2_4.png
 
 A line is the mean over variants and seeds of the score (normalised incremental IoU) after so many iterations, one
-episode each, and its band one standard deviation. It is the score under the contact that was optimised, but with a falling learning rate under hard contact,
-by which that method chooses.
+episode each, and its band one standard deviation. It is the score under the contact that was
+optimised, but with a falling learning rate under hard contact, by which that method chooses.
 """
 
 from __future__ import annotations
