@@ -102,7 +102,7 @@ def learn(args: argparse.Namespace) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     env = Diary(PlasticineEnv(args.task, args.variant))
     agent = make_agent(args.method, env, args.seed)
-    horizon = env.unwrapped.episode_steps  # type: ignore[attr-defined]
+    horizon = env.unwrapped.scene.horizon  # type: ignore[attr-defined]
     begin = time.perf_counter()
     agent.learn(args.episodes * horizon)
     wall = time.perf_counter() - begin
