@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,7 @@ from rpg.training.checkpoint import load_checkpoint
 from rpg.training.config import LoggerConfig, RunConfig, TrainerConfig
 from rpg.training.loggers import Loggers, Sink, TensorBoardSink, WandbSink
 from rpg.training.trainer import Trainer
+from rpg.training.video import check_pictures
 
 EXPLORATIONS: dict[str, type[Any]] = {
     "none": RNDConfig,  # which nobody reads
@@ -196,6 +198,9 @@ def build_trainer(run: RunConfig) -> Trainer:
     Raises:
         RPGError: a bad setting, a missing package, or a run folder that cannot be written.
     """
+    film_envs = partial(make_envs, run.env.for_evaluation(), 1, render=True)
+    if run.trainer.video_every:
+        check_pictures(film_envs, run.seed, run.env.name)
     if run.threads is not None:
         torch.set_num_threads(run.threads)
     # Saturated networks make numbers so small that a CPU computes with them many times slower.
@@ -218,7 +223,7 @@ def build_trainer(run: RunConfig) -> Trainer:
         plain_config=run.plain,
         env_name=run.env.name,
         action_repeat=run.env.action_repeat,
-        film_envs=lambda: make_envs(run.env.for_evaluation(), 1, render=True),
+        film_envs=film_envs,
     )
     if run.compile:
         trainer.compile()

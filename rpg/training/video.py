@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import torch
 from gymnasium.vector import VectorEnv, VectorWrapper
@@ -57,6 +60,30 @@ def film(
             raise RPGError(f"video {path}: {error.strerror or error}; choose another place") from error
 
 
+def check_pictures(make: Callable[[], VectorEnv[Any, Any, Any]], seed: int, name: str) -> None:
+    """Draw one picture of the environment that ``make`` makes, so that what is missing shows before a long run.
+
+    Raises:
+        RPGError: there is none, or drawing needs a package that is missing.
+    """
+    with closing(make()) as envs:
+        envs.reset(seed=seed)
+        _picture(envs, name)
+
+
+def _picture(envs: VectorEnv[Any, Any, Any], name: str) -> NDArray[np.uint8]:
+    """Of the first environment, (height, width, 3)."""
+    try:
+        frames = envs.render()
+    except gym.error.DependencyNotInstalled as error:
+        raise RPGError(f"{name}: no video, {' '.join(str(error).split())}") from error
+    if not frames or frames[0] is None:
+        raise RPGError(
+            f"{name}: the environment draws no pictures (render_mode 'rgb_array'), so there is no video"
+        )
+    return np.asarray(frames[0], dtype=np.uint8)
+
+
 class _Camera(VectorWrapper):
     """Passes everything through, and takes a picture of what it leads to until enough episodes are over."""
 
@@ -81,12 +108,7 @@ class _Camera(VectorWrapper):
     def _take(self, times: int) -> None:
         if not self.episodes:
             return
-        frames = self.env.render()
-        if not frames or frames[0] is None:
-            raise RPGError(
-                f"{self._name}: the environment draws no pictures (render_mode 'rgb_array'), so there is no video"
-            )
-        frame: NDArray[np.uint8] = np.asarray(frames[0], dtype=np.uint8)
+        frame = _picture(self.env, self._name)
         height, width = frame.shape[:2]
         even = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)))  # as the codec wants it
         for _ in range(times):

@@ -22,6 +22,7 @@ from rpg.agents import Agent
 from rpg.errors import RPGError
 from rpg.evaluate import main as evaluate_main
 from rpg.train import train
+from rpg.training.build import build_trainer, parse_config
 from rpg.training.video import film
 
 
@@ -86,6 +87,26 @@ def test_mp4_has_the_same_pictures(tmp_path: Path) -> None:
         frames = [frame[10, 10].mean() for frame in reader]
         assert reader.get_meta_data()["fps"] == 4
     assert np.allclose(frames, [0, 60, 120, 180, 180], atol=6)
+
+
+class Undrawable(Dial):
+    """Needs a package to draw that is not there."""
+
+    def __init__(self, render_mode: str | None = None) -> None:
+        super().__init__(draws=render_mode is not None)
+
+    def render(self) -> Any:
+        raise gym.error.DependencyNotInstalled("easel is not installed,\nrun `pip install easel`")
+
+
+def test_a_missing_package_shows_before_training(composed: Callable[..., DictConfig]) -> None:
+    gym.register("Undrawable-v0", Undrawable)
+    try:
+        run = composed("env=gymnasium", "id=Undrawable-v0", "trainer.video_every=1000")
+        with pytest.raises(RPGError, match="^Undrawable-v0: no video, easel is not installed, run `pip"):
+            build_trainer(parse_config(run))
+    finally:
+        gym.registry.pop("Undrawable-v0")
 
 
 def test_what_cannot_be_filmed(tmp_path: Path) -> None:
