@@ -28,12 +28,13 @@ from typing import Any, NamedTuple
 import torch
 from growing_table import Table
 from matplotlib.axes import Axes
+from matplotlib.ticker import NullLocator
 from plasticine_motion import pressing_actions
 from torch import Tensor
 
 from rpg.cli import report_errors
 from rpg.errors import RPGError, nearest
-from rpg.figures import INK, color, legend, new_figure, save, style_axes
+from rpg.figures import INK, PALETTE, color, legend, new_figure, save, style_axes
 from rpg.plasticine.scene import Scene, load_scene
 from rpg.plasticine.score import score_mass
 from rpg.plasticine.solver import Solver, SolverConfig, hard_score
@@ -43,6 +44,7 @@ from rpg.stats import pareto_front
 
 _OUT = Path("results/pareto/plasticine.csv")
 _KEY = ["task", "config"]
+_TICKS = (1, 2, 3, 5, 10, 20, 30, 50, 100)
 _MEASURED = ["forward_ms", "forward_backward_ms", "density_l1", "particle_cells", "cosine", "score"]
 _COLUMNS = [
     *_KEY, "knob", "dtype", "sweeps", "substeps", "dt", "grid", "particles", "softness", *_MEASURED, "steps", "repeats",
@@ -216,7 +218,7 @@ def draw() -> Path:
         kind = "forward" if cost == "forward_ms" else "forward + backward"
         style_axes(ax, f"ms per environment step, {kind}", label)
     for index, knob in enumerate(knobs):
-        axes[0].plot([], [], "o", color=color(index), label=knob)
+        axes[0].plot([], [], _marker(index), color=color(index), label=knob)
     legend(fig, axes[0], columns=len(knobs))
     out = _OUT.with_suffix(".png")
     save(fig, out)
@@ -233,6 +235,11 @@ def _error(rows: Sequence[dict[str, str]], column: str) -> float | None:
     return 1 - _mean(rows, column) if column == "cosine" else _mean(rows, column)
 
 
+def _marker(index: int) -> str:
+    """Colours repeat, so markers change with every round of them."""
+    return "osD"[index // len(PALETTE)]
+
+
 def _scatter(
     ax: Axes,
     points: Sequence[tuple[str, float, float]],
@@ -243,12 +250,22 @@ def _scatter(
     ax.set_yscale("log")
     if not points:
         return
+    times = [ms for _, ms, _ in points]
+    ticks = [ms for ms in _TICKS if min(times) <= ms <= max(times)]
+    ax.set_xticks(ticks, [str(ms) for ms in ticks])
+    ax.xaxis.set_minor_locator(NullLocator())
     front = pareto_front([ms for _, ms, _ in points], [-error for _, _, error in points])
     stairs = [points[i][1:] for i in front]
     ax.step(*zip(*stairs, strict=True), where="post", color=INK, linewidth=0.8, zorder=1)
     for i, (name, ms, error) in enumerate(points):
         knob = groups[name][0]["knob"] or "default"
-        ax.plot(ms, error, "o", color=color(knobs.index(knob)), markersize=5 if i in front else 3)
+        ax.plot(
+            ms,
+            error,
+            _marker(knobs.index(knob)),
+            color=color(knobs.index(knob)),
+            markersize=5 if i in front else 3,
+        )
         ax.annotate(
             name, (ms, error), (4, -2), textcoords="offset points", va="top", fontsize=7 if i in front else 5
         )

@@ -16,9 +16,12 @@ from rpg.errors import RPGError, nearest
 # Numbers that a preset changes against the defaults of `SceneConfig`.
 PRESETS: dict[str, dict[str, Any]] = {
     "default": {},
-    "fast": {"sweeps": 2},
+    "fast": {},  # and fewer substeps
     "exact": {"dtype": "float64"},
 }
+
+# Of an environment step's substeps; the step stays as long as it is. 14 in place of 19, three quarters of the time.
+FAST_SUBSTEPS = 0.74
 
 # Sweeps of the eigenproblem that its adjoint needs to be as good as the dtype.
 SWEEPS = {"float32": 3, "float64": 6}
@@ -177,9 +180,14 @@ def load_config(
     variants = cfg.variants or {1: {}}
     if variant not in variants:
         raise RPGError(f"{where}: variant={variant!r} is unknown; known: {', '.join(map(str, variants))}")
-    for changes in (variants[variant] or {}, PRESETS[preset], overrides or {}):
+    for changes in (variants[variant] or {}, PRESETS[preset]):
         for key, value in changes.items():
             _set(cfg, str(key), value, where)
+    if preset == "fast":
+        substeps = max(1, round(FAST_SUBSTEPS * cfg.substeps))
+        cfg.dt, cfg.substeps = cfg.dt * cfg.substeps / substeps, substeps
+    for key, value in (overrides or {}).items():
+        _set(cfg, str(key), value, where)
     try:
         config: Any = OmegaConf.to_object(cfg)
     except OmegaConfBaseException as error:

@@ -10,6 +10,7 @@ from omegaconf import OmegaConf
 import rpg.conf
 from rpg.errors import RPGError
 from rpg.plasticine.sampling import PARTICLE_VOLUME, sample
+from rpg.plasticine.scene import load_scene
 from rpg.plasticine.scenes import PRESETS, SceneConfig, load_config, scene_names
 
 CONF = Path(rpg.conf.__file__).parent / "plasticine"
@@ -77,8 +78,18 @@ def test_a_file_of_ones_own(mine: str) -> None:
     assert load_config(OmegaConf.create(MINE)) == load_config(mine)
 
 
+def test_fast_takes_fewer_substeps_for_a_step_of_the_same_length(mine: str) -> None:
+    default, fast = load_config("move"), load_config("move", preset="fast")
+    assert (default.substeps, fast.substeps) == (19, 14)
+    assert fast.dt * fast.substeps == pytest.approx(default.dt * default.substeps, rel=1e-12)
+    assert load_config(mine, 1, "fast", {"substeps": 5}).substeps == 5
+    for name in scene_names():  # the stable limit is checked
+        load_scene(name, preset="fast")
+
+
 def test_later_settings_win(mine: str) -> None:
-    assert load_config(mine, 1, "fast").sweeps == PRESETS["fast"]["sweeps"]
+    assert load_config(mine, 1, "exact").dtype == PRESETS["exact"]["dtype"]
+    assert load_config(mine, 1, "exact", {"dtype": "float32"}).dtype == "float32"
     assert load_config(mine, 1, "exact", {"sweeps": 9}).sweeps == 9
 
 
