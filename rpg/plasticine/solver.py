@@ -158,7 +158,8 @@ class Solver:
         else:
             best = int(losses.argmin())
         loss, score = float(losses[best]), float(scores[best])
-        if score > self.best_score if by_score else loss < self.best_loss:
+        better = score > self.best_score if by_score else loss < self.best_loss
+        if better:
             self.best_loss, self.best_score = loss, score
             self.best_actions = actions[best].cpu().clone()
         return best, loss, score
