@@ -6,8 +6,8 @@
     python scripts/plasticine_table.py gather               # runs/solve -> results/plasticine/table_2_1.csv, curves.csv
     python scripts/plasticine_table.py draw                 # results/plasticine/curves.csv -> figure_2_4.png
 
-Every run is an ordinary `rpg-solve` command, one thread each unless `--threads` says otherwise, that resumes where it
-was interrupted. `gather` keeps rows of runs whose folders are gone. Scores are under hard contact.
+Every run is an ordinary `rpg-solve` command, one thread and 2 GB each unless `--threads` says otherwise, that resumes
+where it was interrupted. `gather` keeps rows of runs whose folders are gone. Scores are under hard contact.
 """
 
 from __future__ import annotations
@@ -50,6 +50,7 @@ class SolveJob(Job):
         """The `rpg-solve` command."""
         return [
             sys.executable, "-m", "rpg.solve", *self.overrides, f"threads={self.threads}", f"run_dir='{self.folder}'",
+            "+scene.keep_substeps=true",
         ]  # fmt: skip
 
 

@@ -26,7 +26,7 @@ contact (a = 0): s = 1 for ``d <= 0``.
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import torch
 
@@ -93,6 +93,14 @@ class Backend(Protocol):
             softness: a in the contact strength exp(-a d); 0 is hard contact.
         """
 
+    def record(
+        self, particles: Particles, material: torch.Tensor, motion: torch.Tensor, softness: float
+    ) -> tuple[Particles, Any]:
+        """As `step`, and a recording of its substeps for `step_backward`, which need not compute them again.
+
+        A recording holds the state and the nodes of every substep, in memory of its own. It serves once.
+        """
+
     def step_backward(
         self,
         particles: Particles,
@@ -100,10 +108,12 @@ class Backend(Protocol):
         motion: torch.Tensor,
         softness: float,
         gradient: Particles,
+        recording: Any = None,
     ) -> StepGradient:
         """Adjoints of everything that `step` read, given those of its result.
 
-        Recomputes the substeps from ``particles``; memory beyond that of one environment step is not held afterwards.
+        Without the recording of the same step, recomputes the substeps from ``particles``; memory beyond that of one
+        environment step is not held afterwards.
         """
 
     def grid_mass(self, x: torch.Tensor) -> torch.Tensor:

@@ -180,7 +180,9 @@ class Scene:
         # A position or pose that is infinite would be clamped, and nothing yields beyond a limit that is NaN.
         if not guard.is_finite(*state.particles, state.material, state.poses.to(self.dtype)):
             raise guard.diagnose(self, state, moving, softness, state._replace(time=state.time + 1))
-        particles = advance(self.backend, state.particles, state.material, moving, softness)
+        particles = advance(
+            self.backend, state.particles, state.material, moving, softness, self.config.keep_substeps
+        )
         result = State(particles, poses, state.material, state.time + 1)
         if not guard.is_finite(*particles, moving):
             raise guard.diagnose(self, state, moving, softness, result)
@@ -189,7 +191,8 @@ class Scene:
     def rollout(self, actions: Tensor, softness: float | None = None, state: State | None = None) -> Rollout:
         """Apply actions one after the other.
 
-        For a gradient one state of every environment step is kept, and nothing of its substeps.
+        For a gradient one state of every environment step is kept, and nothing of its substeps unless the scene has
+        ``keep_substeps``.
 
         Args:
             actions: (T, action_dim) or (B, T, action_dim).

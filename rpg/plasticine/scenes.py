@@ -114,6 +114,8 @@ class SceneConfig:
         targets: public, own, a file of targets, or null: public where RPG_PLASTICINE_TARGETS names its file, else own.
         backend: numba or taichi.
         device: cpu or cuda.
+        keep_substeps: of a rollout with gradients, in memory, rather than simulate each environment step once more
+            on the way back.
         unstable: take a time step above the stable limit.
         variants: by number, dotted settings that each of them changes.
     """
@@ -139,6 +141,7 @@ class SceneConfig:
     targets: str | None = None
     backend: str = "numba"
     device: str = "cpu"
+    keep_substeps: bool = False
     unstable: bool = False
     variants: dict[int, dict[str, Any]] = field(default_factory=dict)
 

@@ -49,28 +49,35 @@ def make_backend(
 
 
 class _Step(torch.autograd.Function):
-    """An environment step that keeps its input alone and recomputes the substeps in the backward pass."""
+    """An environment step that keeps its input alone and recomputes the substeps in the backward pass, or records."""
 
     @staticmethod
     def forward(
         ctx: Any,
         backend: Backend,
         softness: float,
+        records: bool,
         material: torch.Tensor,
         motion: torch.Tensor,
         *state: torch.Tensor,
     ) -> tuple[torch.Tensor, ...]:
         ctx.backend, ctx.softness = backend, softness
         ctx.save_for_backward(material, motion, *state)
-        return tuple(backend.step(Particles(*state), material, motion, softness))
+        ctx.recording = None
+        if not records:
+            return tuple(backend.step(Particles(*state), material, motion, softness))
+        after, ctx.recording = backend.record(Particles(*state), material, motion, softness)
+        return tuple(after)
 
     @staticmethod
     def backward(ctx: Any, *gradients: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         material, motion, *state = ctx.saved_tensors
+        recording, ctx.recording = ctx.recording, None  # its memory is free for the next rollout
+        given = Particles(*(g.contiguous() for g in gradients))
         adjoint = ctx.backend.step_backward(
-            Particles(*state), material, motion, ctx.softness, Particles(*(g.contiguous() for g in gradients))
+            Particles(*state), material, motion, ctx.softness, given, recording
         )
-        return (None, None, adjoint.material, adjoint.motion, *adjoint.particles)
+        return (None, None, None, adjoint.material, adjoint.motion, *adjoint.particles)
 
 
 class _GridMass(torch.autograd.Function):
@@ -87,10 +94,20 @@ class _GridMass(torch.autograd.Function):
 
 
 def advance(
-    backend: Backend, particles: Particles, material: torch.Tensor, motion: torch.Tensor, softness: float
+    backend: Backend,
+    particles: Particles,
+    material: torch.Tensor,
+    motion: torch.Tensor,
+    softness: float,
+    keep_substeps: bool = False,
 ) -> Particles:
-    """`Backend.step` with gradients for particles, material and motion (same shapes)."""
-    return Particles(*_Step.apply(backend, softness, material, motion, *particles))
+    """`Backend.step` with gradients for particles, material and motion (same shapes).
+
+    Where a gradient may be asked for, ``keep_substeps`` takes memory for them instead of time to recompute them.
+    """
+    inputs = (material, motion, *particles)
+    records = keep_substeps and torch.is_grad_enabled() and any(part.requires_grad for part in inputs)
+    return Particles(*_Step.apply(backend, softness, records, *inputs))
 
 
 def grid_mass(backend: Backend, x: torch.Tensor) -> torch.Tensor:

@@ -275,6 +275,32 @@ def test_threads_and_batches_change_nothing(batch: int, threads: Any) -> None:
             close(ours[n], theirs[0], 1e-8)
 
 
+@pytest.mark.parametrize("batch", [1, 3])
+@pytest.mark.parametrize("after", [1, 2])
+def test_a_recorded_step_has_the_same_adjoint(batch: int, after: int, threads: Any) -> None:
+    """Also by another number of threads than recorded it."""
+    backend = make(("sphere", "capsule"), substeps=19)
+    backend._nodes = 64  # has to grow while it records
+    scene = random_scene(tools=2, substeps=19, batch=batch)
+    gradient = weights(scene[0])
+    threads(2)
+    found, recording = backend.record(*scene, 30.0)
+    other = random_scene(tools=2, seed=5, substeps=19, batch=batch)
+    backend.step_backward(*other, 30.0, gradient)  # in between, on the same scratch
+    for ours, theirs in zip(found, backend.step(*scene, 30.0), strict=True):
+        assert ours.equal(theirs)
+    wanted = backend.step_backward(*scene, 30.0, gradient)
+    threads(after)
+    adjoint = backend.step_backward(*scene, 30.0, gradient, recording)
+    both = zip(
+        (*adjoint.particles, adjoint.material, adjoint.motion),
+        (*wanted.particles, wanted.material, wanted.motion),
+        strict=True,
+    )
+    for ours, theirs in both:
+        close(ours, theirs, 1e-12 if after == 2 else 1e-8)
+
+
 def test_particles_that_race_through_the_grid_are_followed() -> None:
     """Their rows of nodes change many times in a step: the layout has to follow them."""
     one, many = make(substeps=1, dt=1e-3), make(substeps=19, dt=1e-3)

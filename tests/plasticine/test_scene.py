@@ -83,6 +83,28 @@ def test_a_rollout_fills_the_gradient_of_its_actions() -> None:
     assert actions.grad.abs().sum() > 0
 
 
+@pytest.mark.parametrize("backend", ["numba", "taichi"])
+def test_kept_substeps_change_no_gradient(backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    gradients, simulated = [], []
+    for keep in (False, True):
+        scene = small(backend=backend, keep_substeps=keep)
+        record = scene.backend.record
+        monkeypatch.setattr(
+            scene.backend, "record", lambda *given, of=record: simulated.append(of) or of(*given)
+        )
+        actions = torch.full((3, scene.action_dim), 0.3, requires_grad=True)
+        loss = scene.rollout(actions).losses.sum()
+        loss.backward(retain_graph=True)
+        once = actions.grad.clone()
+        loss.backward()
+        torch.testing.assert_close(actions.grad, 2 * once)
+        gradients.append(once)
+        with torch.no_grad():
+            scene.rollout(actions)
+        assert len(simulated) == 3 * keep
+    torch.testing.assert_close(*gradients, rtol=1e-6, atol=1e-9)
+
+
 def test_a_batch_is_its_members() -> None:
     scene = small("rope")
     actions = torch.rand(3, 2, scene.action_dim, generator=torch.Generator().manual_seed(0)) * 2 - 1

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import threading
+import weakref
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -19,7 +21,15 @@ from rpg.plasticine.numba_backend.simd import LANES
 from rpg.plasticine.numba_backend.step import step_scene
 from rpg.plasticine.numba_backend.step_adjoint import step_scene_adjoint
 from rpg.plasticine.numba_backend.surface import TOOL, describe
-from rpg.plasticine.numba_backend.workspace import ABORTED, WANTED, Settings, Space, make_space, quads_of
+from rpg.plasticine.numba_backend.workspace import (
+    ABORTED,
+    WANTED,
+    Settings,
+    Space,
+    make_recorded,
+    make_space,
+    quads_of,
+)
 from rpg.plasticine.physics import Physics, Tool
 
 # A step of one scene, given settings, space, thread, team and scene; False where its nodes did not fit.
@@ -33,6 +43,19 @@ def _flat(tensor: torch.Tensor) -> Array:
 def _like(tensor: torch.Tensor) -> torch.Tensor:
     """Uninitialised, and contiguous even where the tensor is not."""
     return torch.empty(tensor.shape, dtype=tensor.dtype)
+
+
+@dataclass(frozen=True)
+class _Recording:
+    """Substeps of a batch.
+
+    Attributes:
+        arrays: of every scene, see `workspace.RECORDED`.
+        teams: how many threads simulated each scene; the adjoint needs as many.
+    """
+
+    arrays: list[dict[str, Array]]
+    teams: list[int]
 
 
 class NumbaBackend:
@@ -73,6 +96,8 @@ class NumbaBackend:
         # Arrays by the size of the team and the number of the team.
         self._spaces: dict[tuple[int, int], Space] = {}
         self._nodes = 4 * len(self._mass) + 4096
+        # Arrays of recordings that nobody needs any more, by team and nodes: getting memory takes longer than a step.
+        self._spare: dict[tuple[int, int], list[dict[str, Array]]] = {}
         self._lock = threading.Lock()
 
     def step(
@@ -89,6 +114,32 @@ class NumbaBackend:
         self._run(step, False, softness, len(particles.x))
         return after
 
+    def record(
+        self, particles: Particles, material: torch.Tensor, motion: torch.Tensor, softness: float
+    ) -> tuple[Particles, _Recording]:
+        """See `rpg.plasticine.backend.Backend.record`."""
+        self._check(particles, material, motion)
+        after, batch = Particles(*map(_like, particles)), len(particles.x)
+        inputs, outputs = (self._inputs(particles, material, motion), tuple(map(_flat, after)))
+        recording = _Recording([{}] * batch, [0] * batch)
+
+        def make_room(team: int, scenes: range) -> None:
+            spare = self._spare.setdefault((team, self._nodes), [])
+            for scene in scenes:
+                arrays = (
+                    spare.pop() if spare else make_recorded(self.physics, len(self._mass), team, self._nodes)
+                )
+                recording.arrays[scene] = arrays
+                weakref.finalize(recording, spare.append, arrays)
+
+        def step(settings: Settings, space: Space, thread: int, team: int, scene: int) -> bool:
+            recording.teams[scene] = team
+            space = space._replace(**recording.arrays[scene])
+            return step_scene(settings, space, thread, team, True, scene, *inputs, *outputs)
+
+        self._run(step, False, softness, batch, make_room)
+        return after, recording
+
     def step_backward(
         self,
         particles: Particles,
@@ -96,6 +147,7 @@ class NumbaBackend:
         motion: torch.Tensor,
         softness: float,
         gradient: Particles,
+        recording: _Recording | None = None,
     ) -> StepGradient:
         """See `rpg.plasticine.backend.Backend.step_backward`."""
         self._check(particles, material, motion)
@@ -105,7 +157,9 @@ class NumbaBackend:
         adjoints = tuple(map(_flat, (*gradient, *before, of_material, of_motion)))
 
         def step(settings: Settings, space: Space, thread: int, team: int, scene: int) -> bool:
-            if not step_scene(settings, space, thread, team, True, scene, *inputs, *unused):
+            if recording is not None and recording.teams[scene] == team:
+                space = space._replace(**recording.arrays[scene])
+            elif not step_scene(settings, space, thread, team, True, scene, *inputs, *unused):
                 return False
             step_scene_adjoint(settings, space, thread, team, scene, inputs[0], inputs[-1], *adjoints)
             return True
@@ -186,31 +240,41 @@ class NumbaBackend:
             self._spaces[team, number] = space
         return space
 
-    def _run(self, step: Step, adjoint: bool, softness: float, batch: int) -> None:
-        """Step every scene of a batch on as many threads as there are."""
+    def _run(
+        self,
+        step: Step,
+        adjoint: bool,
+        softness: float,
+        batch: int,
+        make_room: Callable[[int, range], None] = lambda team, scenes: None,
+    ) -> None:
+        """Step every scene of a batch on as many threads as there are.
+
+        ``make_room`` is called with their number and scenes before these, and again where they need more nodes.
+        """
         with self._lock, crew().claimed() as free:
             count = threads() if free else 1
             apart = batch if count == 1 else batch // count * count
-            rest = range(apart, batch)
-            while apart and not self._run_apart(step, adjoint, self._settings(softness), count, apart):
-                self._make_room()
-            while rest and not self._run_together(step, adjoint, self._settings(softness), count, rest):
-                self._make_room()
+            parts = (range(apart), self._run_apart), (range(apart, batch), self._run_together)
+            for scenes, run in parts:
+                make_room(count, scenes)
+                while scenes and not run(step, adjoint, self._settings(softness), count, scenes):
+                    self._widen()
+                    make_room(count, scenes)
 
-    def _make_room(self) -> None:
+    def _widen(self) -> None:
         """Let grids have the size that a kernel asked for, and some more."""
         wanted = max(int(space.sync[WANTED]) for space in self._spaces.values())
         self._nodes = wanted + wanted // 4
+        self._spare.clear()
 
-    def _run_apart(self, step: Step, adjoint: bool, settings: Settings, count: int, batch: int) -> bool:
+    def _run_apart(self, step: Step, adjoint: bool, settings: Settings, count: int, scenes: range) -> bool:
         """Every thread takes scenes of its own; False where they did not fit."""
         spaces = [self._space(1, number, adjoint) for number in range(count)]
         done = [False] * count
 
         def work(number: int) -> None:
-            done[number] = all(
-                step(settings, spaces[number], 0, 1, scene) for scene in range(number, batch, count)
-            )
+            done[number] = all(step(settings, spaces[number], 0, 1, scene) for scene in scenes[number::count])
 
         crew().run([partial(work, number) for number in range(count)], lambda: None)
         return all(done)

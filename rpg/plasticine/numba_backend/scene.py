@@ -79,13 +79,13 @@ def _copy_out(source: Array, place: int, fields: int, values: Array, at: int) ->
 
 @inlined
 def store_particles(
-    space: Space, first: int, last: int, scene: int, count: int, x: Array, v: Array, c: Array, b: Array
-) -> None:
-    """Write groups first .. last - 1 to where their particles belong."""
+    space: Space, slot: int, first: int, last: int, scene: int, count: int, x: Array, v: Array, c: Array, b: Array
+) -> None:  # fmt: skip
+    """Write groups first .. last - 1 to where their particles belong; their states begin at ``state[slot]``."""
     for place in range(first * LANES, last * LANES):
         i = get(space.order, place)
         if i >= 0:
-            at = place // LANES * STATE * LANES + place % LANES
+            at = slot + place // LANES * STATE * LANES + place % LANES
             n = scene * count + i
             _copy_out(space.state, at, 3, x, 3 * n)
             _copy_out(space.state, at + V * LANES, 3, v, 3 * n)

@@ -167,7 +167,7 @@ def step_scene(
         arrays: of the team.
         thread: this thread's number in the team.
         team: how many threads there are.
-        record: keep in the space what `step_adjoint.step_scene_adjoint` needs, instead of writing the result.
+        record: keep in the space what `step_adjoint.step_scene_adjoint` needs.
         scene: number in the batch.
         count: particles of a scene.
         x: positions of all scenes, flat; then v, c, b, material likewise, mass and volume of one scene.
@@ -183,9 +183,9 @@ def step_scene(
     m = scene * settings.substeps * settings.tools * NUMBERS_OF_MOTION
     if not simulate(settings, space, thread, team, record, tool_motion, m):
         return False
-    if not record:
-        first, end, _ = own_groups(settings, thread, team)
-        store_particles(space, first, end, scene, count, new_x, new_v, new_c, new_b)
+    first, end, groups = own_groups(settings, thread, team)
+    slot = settings.substeps * groups * STATE * LANES if record else 0
+    store_particles(space, slot, first, end, scene, count, new_x, new_v, new_c, new_b)
     # The next scene may not be sorted before every thread is done with the order of this one.
     wait(space.sync, team)
     return True

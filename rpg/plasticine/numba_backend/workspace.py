@@ -146,32 +146,50 @@ def quads_of(nodes: int) -> int:
     return -(-4 * nodes // LANES) * LANES
 
 
+# What the adjoint reads of a step that was simulated, `make_recorded`; the rest of a space is scratch.
+RECORDED = ("order", "fixed", "state", "eigen", "head", "table", "rows", "used", "velocity", "momentum")
+
+
+def make_recorded(physics: Physics, particles: int, team: int, nodes: int) -> dict[str, Array]:
+    """Arrays of one scene that take the place of a space's for a team of at most so many threads, by `RECORDED`."""
+    return _recorded(physics, particles, team, nodes, adjoint=True)
+
+
+def _recorded(physics: Physics, particles: int, team: int, nodes: int, adjoint: bool) -> dict[str, Array]:
+    groups, rows = -(-particles // LANES), (physics.grid + 1) ** 2
+    steps, kept = (physics.substeps, physics.substeps) if adjoint else (1, 0)
+    real, whole, quads = physics.dtype, np.int32, quads_of(nodes)
+    arrays = (
+        np.zeros(groups * LANES, whole),
+        _empty(groups * FIXED * LANES, real),
+        _empty((kept + 1) * groups * STATE * LANES, real),
+        _empty(kept * groups * EIGEN * LANES, real),
+        np.zeros(steps * (HEAD + 3 * team), np.int64),
+        _empty(steps * rows, whole),
+        _empty(steps * rows * ROW, whole),
+        np.zeros(2 * physics.substeps, np.int64),
+        _empty(steps * quads, real),
+        _empty(kept * quads, real),
+    )
+    return dict(zip(RECORDED, arrays, strict=True))
+
+
 def make_space(physics: Physics, particles: int, tools: Array, team: int, nodes: int, adjoint: bool) -> Space:
     """Allocate for a team of threads, with room for that many nodes in a substep's grid."""
     groups = -(-particles // LANES)
     rows = (physics.grid + 1) ** 2
     count = len(tools)
-    steps = physics.substeps if adjoint else 1
     kept = physics.substeps if adjoint else 0
     real, whole = physics.dtype, np.int32
     quads = quads_of(nodes)
     return Space(
+        **_recorded(physics, particles, team, nodes, adjoint),
         sync=np.zeros(4 * APART, np.int64),
-        order=np.zeros(groups * LANES, whole),
         bins=np.zeros(rows + 1, whole),
-        fixed=_empty(groups * FIXED * LANES, real),
-        state=_empty((kept + 1) * groups * STATE * LANES, real),
-        eigen=_empty(kept * groups * EIGEN * LANES, real),
         adjoint=_empty((groups if adjoint else 0) * ADJOINT * LANES, real),
         extents=_empty(team * 2 * rows, whole),
         reach=np.zeros(2 * team, whole),
-        head=np.zeros(steps * (HEAD + 3 * team), np.int64),
-        table=_empty(steps * rows, whole),
-        rows=_empty(steps * rows * ROW, whole),
-        used=np.zeros(2 * physics.substeps, np.int64),
         private=_zeros(team * quads, real),
-        velocity=_empty(steps * quads, real),
-        momentum=_empty(kept * quads, real),
         pull=_empty(quads if adjoint else 0, real),
         fastest=np.zeros(team * APART, np.float64),
         scratch=_zeros(team * SCRATCH, real),

@@ -114,6 +114,13 @@ class TaichiBackend:
         run = self._run(particles, material, motion, softness, keep=False)
         return run.states[self.physics.substeps % 2]
 
+    def record(
+        self, particles: Particles, material: torch.Tensor, motion: torch.Tensor, softness: float
+    ) -> tuple[Particles, _Run]:
+        particles, material, motion = self._checked(particles, material, motion)
+        run = self._run(particles, material, motion, softness, keep=True)
+        return Particles(*map(torch.clone, run.states[-1])), run
+
     def step_backward(
         self,
         particles: Particles,
@@ -121,9 +128,10 @@ class TaichiBackend:
         motion: torch.Tensor,
         softness: float,
         gradient: Particles,
+        recording: _Run | None = None,
     ) -> StepGradient:
         particles, material, motion = self._checked(particles, material, motion)
-        run = self._run(particles, material, motion, softness, keep=True)
+        run = recording or self._run(particles, material, motion, softness, keep=True)
         adjoint = Particles(*(part.detach().to(self._dtype, copy=True).contiguous() for part in gradient))
         material_adjoint, motion_adjoint = torch.zeros_like(material), torch.zeros_like(motion)
         boxes, workers = run.window.boxes, self._workers(particles.x)
