@@ -37,6 +37,7 @@ CURVES = [*KEY, "episode", "loss", "score"]
 RECIPES: dict[str, tuple[str, ...]] = {
     **{method: (f"optimizer={method}",) for method in METHODS},
     "adam_decay": ("optimizer=adam", "lr_final=0.005", "keep=score"),
+    "adam_slow": ("optimizer=adam", "lr=0.01", "keep=score"),
 }
 _PUBLISHED = Path("results/published/plasticine_table_2_1.csv")
 
@@ -108,7 +109,7 @@ def _tell(rows: list[dict[str, str]]) -> None:
         with _PUBLISHED.open(newline="") as file:
             published = {(row["method"], row["task"]): row for row in csv.DictReader(file)}
     for (method, task), values in sorted(scores.items()):
-        other = published.get(("adam" if method == "adam_decay" else method, task))
+        other = published.get((method if method in METHODS else "adam", task))
         beside = f", published {other['mean']} +- {other['std']}" if other else ""
         spread = statistics.pstdev(values)
         print(
