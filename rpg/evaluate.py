@@ -38,9 +38,9 @@ def evaluate_run(run_dir: Path, episodes: int, seed: int, num_envs: int | None =
     Raises:
         RPGError: not a run folder, or a damaged checkpoint.
     """
-    run, state = _load(run_dir)
+    run, state = load_run(run_dir)
     envs = make_envs(run.env.for_evaluation(), num_envs or run.trainer.eval_envs)
-    agent = _agent(run, state, envs)
+    agent = connected_agent(run, state, envs)
     result: dict[str, float] = {}
     for mode, deterministic, planning in agent.evaluations:
         finished = evaluate(agent, envs, episodes, seed, deterministic, run.env.name, planning)
@@ -55,14 +55,20 @@ def film_run(run_dir: Path, path: Path, episodes: int, seed: int, deterministic:
     Raises:
         RPGError: not a run folder, a damaged checkpoint, or an environment that draws nothing.
     """
-    run, state = _load(run_dir)
+    run, state = load_run(run_dir)
     with closing(make_envs(run.env.for_evaluation(), 1, render=True)) as envs:
-        agent = _agent(run, state, envs)
+        agent = connected_agent(run, state, envs)
         film(agent, envs, path, episodes, seed, deterministic, run.env.name)
 
 
-def _agent(run: RunConfig, state: dict[str, Any], envs: VectorEnv[Any, Any, Any]) -> Agent:
-    """The trained agent, connected to what it learned from if it is judged with that."""
+def connected_agent(run: RunConfig, state: dict[str, Any], envs: VectorEnv[Any, Any, Any]) -> Agent:
+    """The agent of a checkpoint, connected to what it learned from if it is judged with that.
+
+    Args:
+        run: settings, with the checkpoint as `load_run` gave them.
+        state: the checkpoint.
+        envs: for which the agent acts.
+    """
     agent, _ = build_agent(run, envs)
     agent.load_state_dict(state["agent"])
     if run.planner is not None:
@@ -70,7 +76,12 @@ def _agent(run: RunConfig, state: dict[str, Any], envs: VectorEnv[Any, Any, Any]
     return agent
 
 
-def _load(run_dir: Path) -> tuple[RunConfig, dict[str, Any]]:
+def load_run(run_dir: Path) -> tuple[RunConfig, dict[str, Any]]:
+    """Settings and checkpoint of a run folder.
+
+    Raises:
+        RPGError: not a run folder, or a damaged checkpoint.
+    """
     state = load_checkpoint(run_dir / "checkpoint.pt")
     if not state["config"]:
         raise RPGError(

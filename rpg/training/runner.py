@@ -32,7 +32,8 @@ class Transition(NamedTuple):
 class Episode(NamedTuple):
     """A finished episode: undiscounted return, length in decisions, success at its end and at any time.
 
-    ``score`` is the task's own measure at the end, for tasks that have one (``info["score"]``).
+    ``score`` is the task's own measure at the end, for tasks that have one (``info["score"]``); ``solved_after`` the
+    decisions until the first success.
     """
 
     ret: float
@@ -40,6 +41,7 @@ class Episode(NamedTuple):
     success_end: bool
     success_ever: bool
     score: float | None = None
+    solved_after: int | None = None
 
 
 class Runner:
@@ -74,7 +76,7 @@ class Runner:
         self._seeds = np.zeros(n, dtype=np.int64)  # of the running episodes
         self._return = np.zeros(n)
         self._length = np.zeros(n, dtype=np.int64)
-        self._ever = np.zeros(n, dtype=np.bool_)
+        self._solved = np.zeros(n, dtype=np.int64)  # decisions until the first success; 0: none yet
         self._steps = 0
         space = envs.single_action_space
         self._first_action = int(space.start) if isinstance(space, Discrete) else None
@@ -100,7 +102,7 @@ class Runner:
         self._started += mask
         with self._watching_workers():
             obs, _ = self._envs.reset(seed=seeds, options={"reset_mask": mask.copy()})  # type: ignore[arg-type]
-        self._return[mask], self._length[mask], self._ever[mask] = 0.0, 0, False
+        self._return[mask], self._length[mask], self._solved[mask] = 0.0, 0, 0
         first = np.tile(self._checked(obs), self._stack)
         self._obs = first if self._stack == 1 else np.where(mask[:, None], first, self._obs)
         self._latent = self._agent.begin_episodes(self._tensor(self._obs), self._tensor(mask), self._latent)
@@ -123,7 +125,7 @@ class Runner:
         success = np.asarray(info.get("success", info.get("is_success", np.zeros(self.num_envs)))) > 0
         self._return += reward
         self._length += 1
-        self._ever |= success
+        self._solved = np.where(success & (self._solved == 0), self._length, self._solved)
         ended = np.logical_or(terminated, truncated)
         score = info.get("score")
         episodes = [
@@ -131,8 +133,9 @@ class Runner:
                 float(self._return[i]),
                 int(self._length[i]),
                 bool(success[i]),
-                bool(self._ever[i]),
+                bool(self._solved[i]),
                 None if score is None else float(score[i]),
+                int(self._solved[i]) or None,
             )
             for i in np.flatnonzero(ended)
         ]
@@ -198,7 +201,7 @@ class Runner:
             "started": torch.from_numpy(self._started.copy()),
             "return": torch.from_numpy(self._return.copy()),
             "length": torch.from_numpy(self._length.copy()),
-            "ever": torch.from_numpy(self._ever.copy()),
+            "solved": torch.from_numpy(self._solved.copy()),
             "steps": self._steps,
             "env": None if env is None else {k: torch.as_tensor(v) for k, v in env.items()},
         }
@@ -224,7 +227,7 @@ class Runner:
         self._latent = state["latent"].to(self._agent.device)
         self._return = state["return"].numpy().copy()
         self._length = state["length"].numpy().copy()
-        self._ever = state["ever"].numpy().copy()
+        self._solved = state["solved"].numpy().copy()
         return True
 
 

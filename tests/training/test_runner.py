@@ -126,6 +126,7 @@ def test_success_is_judged_at_the_end_and_at_any_time(
     for _ in range(2):  # the second episode starts with a clean slate
         episode = [runner.step()[1] for _ in range(3)][-1][0]
         assert (episode.success_end, episode.success_ever) == (at_end, ever)
+        assert episode.solved_after == (success_at if ever else None)
 
 
 def test_success_of_one_episode_is_not_carried_into_the_next() -> None:
