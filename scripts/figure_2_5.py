@@ -71,7 +71,7 @@ def gather() -> Path:
 
 
 def draw() -> Path:
-    """Best score so far and loss against iterations, a line for each yield stress.
+    """Score and loss against iterations, a line for each yield stress.
 
     Raises:
         RPGError: the table is missing.

@@ -33,11 +33,11 @@ from rpg.errors import RPGError
 from rpg.figures import curve, legend, new_figure, save, style_axes
 from rpg.training.loggers import Row, read_rows
 
-_RUNS, _RESULTS = Path("runs/landmarks"), Path("results/landmarks")
-_PRESETS = {"2d_reach": "reach_2d", "2d_push": "push_2d"}  # results are named as in the thesis
+_RUNS, RESULTS = Path("runs/landmarks"), Path("results/landmarks")
+PRESETS = {"2d_reach": "reach_2d", "2d_push": "push_2d"}  # results are named as in the thesis
 _DISCRETE = ("four_room", "acrobot_goal")
 _RUN = ["method", "size", "seed", "env_steps", "wall_s"]
-_COLUMNS = [*_RUN, "success_last", "success_ever"]
+COLUMNS = [*_RUN, "success_last", "success_ever"]
 _DISTANCES = [*_RUN, "distortion", "max_distance"]
 
 
@@ -45,7 +45,7 @@ def jobs_of(args: argparse.Namespace) -> list[Job]:
     """One run for each method and seed; in environments whose planner has no share in exploring one is enough."""
     label = f",{args.label}" if args.label else "".join(f",{text}" for text in args.set)
     agent = "dqn_her" if args.env in _DISCRETE else "ddpg_her"
-    common = [f"agent={agent}", f"env={_PRESETS.get(args.env, args.env)}", f"size={args.size}"]
+    common = [f"agent={agent}", f"env={PRESETS.get(args.env, args.env)}", f"size={args.size}"]
     common += [f"trainer.steps={args.steps}"] if args.steps else []
     common += [f"trainer.stop_at_success={args.stop}"] if args.stop != "none" else []
     jobs = []
@@ -86,8 +86,8 @@ def gather(env: str) -> list[Path]:
         raise RPGError(f"{_RUNS / env}: no run with an evaluation; start some with 'run {env}'")
     written = []
     for name, rows in tables.items():
-        out = _RESULTS / f"{env}{name}.csv"
-        write_table(out, _DISTANCES if name == "_distortion" else _COLUMNS, rows)
+        out = RESULTS / f"{env}{name}.csv"
+        write_table(out, _DISTANCES if name == "_distortion" else COLUMNS, rows)
         written.append(out)
     _table(env).with_suffix(".json").write_text(json.dumps(origins, indent=2) + "\n")
     return written
@@ -122,11 +122,15 @@ def _rows(config: Any, row: Row) -> dict[str, list[dict[str, Any]]]:
 def draw(env: str) -> Path:
     """Draw every method's mean over seeds, with the range of seeds, against env steps and hours.
 
+    Runs of `her_baseline.py` are drawn too, where there are some.
+
     Raises:
         RPGError: the table is missing.
     """
-    success = _read(_table(env))
-    errors = _RESULTS / f"{env}_distortion.csv"
+    success, outside = _read(_table(env)), RESULTS / f"{env}_sb3.csv"
+    if outside.exists():
+        success += _read(outside)
+    errors = RESULTS / f"{env}_distortion.csv"
     panels = 4 if errors.exists() else 2
     fig, axes = new_figure(1, panels, width=3.2, height=2.6)
     _curves(axes[0], success, "env_steps", "success_last")
@@ -163,7 +167,7 @@ def _curves(ax: Axes, rows: list[dict[str, str]], x: str, y: str, unit: float = 
 
 
 def _table(env: str) -> Path:
-    return _RESULTS / f"{env}.csv"
+    return RESULTS / f"{env}.csv"
 
 
 def _read(table: Path) -> list[dict[str, str]]:
