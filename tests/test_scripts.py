@@ -149,3 +149,41 @@ def test_landmark_runs_are_gathered_by_method_and_drawn(tmp_path: Path) -> None:
     assert all(float(row["distortion"]) > 0 for row in tables["four_room_distortion"])
     run(tmp_path, script, "draw", "four_room")
     assert (tmp_path / "results" / "landmarks" / "four_room.png").stat().st_size > 1000
+    pareto = str(ROOT / "scripts" / "planner_pareto.py")
+    words = (str(folder), "--landmarks", "4", "8", "--tau", "1.5", "--maps", "2", "--episodes", "2")
+    assert len(run(tmp_path, pareto, "run", *words).splitlines()) == 3
+    assert run(tmp_path, pareto, "run", *words) == ""  # nothing is measured twice
+    with (tmp_path / "results" / "pareto" / "landmarks.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["knob"], row["landmarks"], float(row["found"])) for row in rows] == [
+        ("landmarks", "4", 4.0), ("landmarks", "8", 8.0), ("tau", "8", 8.0),
+    ]  # fmt: skip
+    assert all(float(row["build_ms"]) > 0 and float(row["step_ms"]) > 0 for row in rows)
+    run(tmp_path, pareto, "draw")
+    assert (tmp_path / "results" / "pareto" / "landmarks.png").stat().st_size > 1000
+    run(tmp_path, pareto, "rebuild", str(folder))
+    with (tmp_path / "results" / "pareto" / "landmarks_rebuild.csv").open() as file:
+        (row,) = csv.DictReader(file)
+    assert (row["rebuild_every"], row["last_env_steps"]) == ("1", "200")
+
+
+def test_goals_for_the_outside_baseline_pay_as_the_environment_does(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "scripts"))
+    module = runpy.run_path(str(ROOT / "scripts" / "her_baseline.py"))
+    settings = module["parse_config"](
+        module["compose_config"]("agent=ddpg_her", "env=reach_2d", f"run_dir={tmp_path}")
+    )
+    env = module["GoalDict"](settings, False)
+    obs, _ = env.reset(seed=0)
+    assert env.observation_space.contains(obs)
+    for _ in range(50):
+        way = obs["desired_goal"] - obs["achieved_goal"]
+        obs, reward, terminated, truncated, _ = env.step(way.clip(-1, 1))
+        assert not terminated
+        goals = obs["achieved_goal"][None], obs["desired_goal"][None]
+        assert reward == env.compute_reward(*goals, [{}])[0]
+        assert env.compute_reward(goals[0], goals[0], [{}])[0] == 0
+    assert truncated
+    env.close()
