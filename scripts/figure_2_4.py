@@ -27,7 +27,6 @@ _METHODS = {
     "adam_hard": "Adam, hard contact",
     "adam_decay": "Adam, falling rate",
     "adam_slow": "Adam, rate 0.01",
-    "adam_400": "Adam, 400 iterations",
 }
 _COLS = 5
 

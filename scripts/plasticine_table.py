@@ -38,7 +38,6 @@ RECIPES: dict[str, tuple[str, ...]] = {
     **{method: (f"optimizer={method}",) for method in METHODS},
     "adam_decay": ("optimizer=adam", "lr_final=0.005", "keep=score"),
     "adam_slow": ("optimizer=adam", "lr=0.01", "keep=score"),
-    "adam_400": ("optimizer=adam", "iterations=400"),
 }
 # Whose published numbers stand beside a recipe of ours.
 _PARENT = {recipe: "adam" for recipe in RECIPES if recipe not in METHODS}
