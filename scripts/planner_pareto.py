@@ -27,6 +27,7 @@ from typing import Any, cast
 import torch
 from growing_table import Table
 from matplotlib.axes import Axes
+from matplotlib.ticker import NullLocator
 
 from rpg.agents.agent import Experience
 from rpg.agents.goal import GoalAgent
@@ -181,6 +182,9 @@ def draw() -> Path:
                 _points(ax, rows, x, y, env, index)
             style_axes(ax, label, name if column == 0 else "")
             ax.set_xscale("log")
+            ticks = (1, 2, 3, 5, 8, 15) if knob == "tau" or x == "step_ms" else _LANDMARKS
+            ax.set_xticks(ticks, [str(tick) for tick in ticks])
+            ax.xaxis.set_minor_locator(NullLocator())
             if place == 0:
                 ax.set_ylim(-0.02, 1.02)
     legend(fig, axes[0])
@@ -190,14 +194,14 @@ def draw() -> Path:
 
 
 def _points(ax: Axes, rows: list[dict[str, str]], x: str, y: str, label: str, index: int) -> None:
-    """Points of single seeds, and a line through the means of equal settings."""
+    """Points of single seeds, and where x is a setting a line through the means of equal ones."""
     groups: dict[tuple[str, str], list[tuple[float, float]]] = defaultdict(list)
     for row in rows:
         groups[row["landmarks"], row["tau"]].append((float(row[x]), float(row[y])))
     means = sorted(tuple(map(statistics.fmean, zip(*points, strict=True))) for points in groups.values())
     if means:
         xs, ys = zip(*means, strict=True)
-        ax.plot(xs, ys, color=color(index), label=label)
+        ax.plot(xs, ys, color=color(index), label=label, linestyle="none" if x == "step_ms" else "-")
     for points in groups.values():
         xs, ys = zip(*points, strict=True)
         ax.scatter(xs, ys, 8, color=color(index), alpha=0.5, linewidths=0)
