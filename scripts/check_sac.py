@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 import torch
 from growing_table import Table
-from side_by_side import Job, run_side_by_side
+from side_by_side import AgainJob, Job, run_side_by_side
 
 from rpg.cli import report_errors
 from rpg.errors import RPGError
@@ -57,16 +57,6 @@ class OurJob(Job):
             f"trainer.steps={self.steps}", "logger=files", "threads=1", *self.overrides,
             f"run_dir='{self.folder}'",
         ]  # fmt: skip
-
-
-@dataclass(frozen=True)
-class TheirJob(Job):
-    """This script again, in a process of its own."""
-
-    @property
-    def command(self) -> list[str]:
-        """One run of the library's agent."""
-        return [sys.executable, __file__, "learn", *self.overrides, "--folder", str(self.folder)]
 
 
 def learn(seed: int, steps: int, folder: Path) -> None:
@@ -110,7 +100,7 @@ def jobs_of(implementations: list[str], seeds: list[int], steps: int) -> list[Jo
                 jobs.append(OurJob(f"rpg seed {seed}", folder, (f"seed={seed}",), steps=steps))
             else:
                 words = ("--seed", str(seed), "--steps", str(steps))
-                jobs.append(TheirJob(f"{name} seed {seed}", folder, words))
+                jobs.append(AgainJob(f"{name} seed {seed}", folder, words))
     return [job for job in jobs if _finished_steps(job.folder) < steps]
 
 

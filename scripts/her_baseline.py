@@ -15,11 +15,9 @@ from __future__ import annotations
 import argparse
 import csv
 import json
-import sys
 import time
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +27,7 @@ import torch
 from gymnasium.spaces import Box, Dict
 from landmarks import COLUMNS, PRESETS, RESULTS
 from numpy.typing import NDArray
-from side_by_side import Job, run_side_by_side, write_table
+from side_by_side import AgainJob, Job, run_side_by_side, write_table
 
 from rpg.cli import report_errors
 from rpg.conf import compose_config
@@ -97,16 +95,6 @@ class GoalDict(gymnasium.Env[dict[str, Any], NDArray[np.float32]]):
     def close(self) -> None:
         """Close the environment."""
         self._envs.close()
-
-
-@dataclass(frozen=True)
-class LearnJob(Job):
-    """One agent, in a process of its own."""
-
-    @property
-    def command(self) -> list[str]:
-        """This script again."""
-        return [sys.executable, __file__, "learn", *self.overrides, "--folder", str(self.folder)]
 
 
 def make_agent(env: GoalDict, settings: RunConfig, seed: int) -> Any:
@@ -198,7 +186,7 @@ def run(args: argparse.Namespace) -> int:
         words = (args.env, "--seed", str(seed), "--steps", str(args.steps), "--every", str(args.every))
         if not (folder / "run.json").exists():
             jobs.append(
-                LearnJob(
+                AgainJob(
                     f"{args.env} her_sb3 seed {seed}", folder, (*words, "--episodes", str(args.episodes))
                 )
             )

@@ -38,6 +38,7 @@ from rpg.evaluate import connected_agent, load_run
 from rpg.figures import color, legend, new_figure, save, style_axes
 from rpg.landmarks import LandmarkPlanner, PlannerConfig
 from rpg.provenance import commit
+from rpg.training.config import RunConfig
 from rpg.training.hindsight import stored_replay
 from rpg.training.loggers import read_rows
 from rpg.training.runner import evaluate
@@ -53,6 +54,18 @@ _REBUILD_COLUMNS = [*_REBUILD_KEY, "env_steps", "wall_s", "last_env_steps", "suc
 _LANDMARKS, _TAUS = (5, 10, 20, 50, 100, 200), (1.5, 2.0, 3.0, 5.0, 8.0, 15.0)
 _LEVEL, _IN_A_ROW = 0.95, 3
 _TIMED = 15
+
+
+def _run_with_planner(folder: Path) -> tuple[RunConfig, PlannerConfig, dict[str, Any]]:
+    """Settings, those of the planner, and the checkpoint.
+
+    Raises:
+        RPGError: the folder is not that of a run with a planner.
+    """
+    settings, state = load_run(folder)
+    if settings.planner is None:
+        raise RPGError(f"{folder}: trained without a planner; choose a run with planner=landmarks")
+    return settings, settings.planner, state
 
 
 def _median_ms(work: Callable[[], object]) -> float:
@@ -76,10 +89,7 @@ def run(
     """
     table = Table(_OUT, _COLUMNS, _KEY)
     for folder in folders:
-        settings, state = load_run(folder)
-        if settings.planner is None:
-            raise RPGError(f"{folder}: trained without a planner; choose a run with planner=landmarks")
-        own = settings.planner
+        settings, own, state = _run_with_planner(folder)
         configs = [
             ("landmarks", replace(own, landmarks=n, candidates=max(own.candidates, n))) for n in landmarks
         ]
@@ -145,15 +155,15 @@ def rebuild(folders: Sequence[Path]) -> None:
     """
     table = Table(_REBUILD, _REBUILD_COLUMNS, _REBUILD_KEY)
     for folder in folders:
-        settings, _ = load_run(folder)
-        if settings.planner is None:
-            raise RPGError(f"{folder}: trained without a planner; choose a run with planner=landmarks")
+        settings, planner, _ = _run_with_planner(folder)
         rows = [row for row in read_rows(folder / "metrics.jsonl") if "eval/planner/success_end" in row]
+        if not rows:
+            raise RPGError(f"{folder}: no evaluation yet; train on")
         good = [float(row["eval/planner/success_end"]) >= _LEVEL for row in rows]
         first = next((i for i in range(len(rows)) if good[i : i + _IN_A_ROW] == [True] * _IN_A_ROW), None)
         reached = {} if first is None else {name: rows[first][name] for name in ("env_steps", "wall_s")}
         table.add(
-            env=settings.env.name, seed=settings.seed, rebuild_every=settings.planner.rebuild_every, **reached,
+            env=settings.env.name, seed=settings.seed, rebuild_every=planner.rebuild_every, **reached,
             last_env_steps=rows[-1]["env_steps"], success_last=rows[-1]["eval/planner/success_end"], commit=commit(),
         )  # fmt: skip
 

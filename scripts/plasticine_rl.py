@@ -16,9 +16,7 @@ from __future__ import annotations
 import argparse
 import csv
 import json
-import sys
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +24,7 @@ import gymnasium
 import torch
 from growing_table import Table
 from plasticine_table import COLUMNS, CURVES, KEY, OUT
-from side_by_side import Job, run_side_by_side
+from side_by_side import AgainJob, Job, run_side_by_side
 
 from rpg.cli import report_errors
 from rpg.envs.plasticine import PlasticineEnv
@@ -36,16 +34,6 @@ from rpg.training.loggers import write_atomic
 
 RUNS = Path("runs/plasticine_rl")
 METHODS = ("ppo", "sac", "td3")
-
-
-@dataclass(frozen=True)
-class LearnJob(Job):
-    """One agent, in a process of its own."""
-
-    @property
-    def command(self) -> list[str]:
-        """This script again."""
-        return [sys.executable, __file__, "learn", *self.overrides, "--folder", str(self.folder)]
 
 
 class Diary(gymnasium.Wrapper[Any, Any, Any, Any]):
@@ -140,7 +128,7 @@ def run(args: argparse.Namespace) -> int:
                 "--episodes", str(args.episodes),
             )  # fmt: skip
             if not (folder / "result.json").exists():
-                jobs.append(LearnJob(f"{args.task} {method} seed {seed}", folder, words))
+                jobs.append(AgainJob(f"{args.task} {method} seed {seed}", folder, words))
     return run_side_by_side(jobs, args.jobs)
 
 

@@ -31,6 +31,16 @@ class Job:
         ]  # fmt: skip
 
 
+@dataclass(frozen=True)
+class AgainJob(Job):
+    """The running script once more as ``learn <overrides> --folder <folder>``, in a process of its own."""
+
+    @property
+    def command(self) -> list[str]:
+        """The script's command."""
+        return [sys.executable, sys.argv[0], "learn", *self.overrides, "--folder", str(self.folder)]
+
+
 def run_side_by_side(jobs: Sequence[Job], count: int) -> int:
     """Run or resume the jobs in order, ``count`` at a time; returns the number of failures."""
 
